@@ -1,0 +1,68 @@
+"""What a world or a data set yields: every reading of every vehicle, and the truth to score it by."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet_seif.records import Floats, Ints, Reading, Sightings
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Log:
+    """Everything one vehicle's filter is fed, in the form of `readings/<vehicle>.npz`.
+
+    time_s (T+1,): the vehicle's own time at pose k.
+    odometry (T, 3), odometry_cov (T, 3, 3): increment i leads from pose i to pose i+1, in the frame of pose i.
+    sighting_step (S,), ascending: index of the pose a sighting was made from.
+    sighting_z (S, 2): range m, bearing rad; sighting_cov (S, 2, 2).
+    sighting_signature (S,): -1 unknown. sighting_truth (S,): index of the true landmark, -1 clutter; scoring only.
+    start_pose (3,), start_pose_cov (3, 3): zeros mean that the start pose is given.
+    truth_pose (T+1, 3): NaN where unknown.
+    """
+
+    vehicle: str
+    time_s: Floats
+    odometry: Floats
+    odometry_cov: Floats
+    sighting_step: Ints
+    sighting_z: Floats
+    sighting_cov: Floats
+    sighting_signature: Ints
+    sighting_truth: Ints
+    start_pose: Floats
+    start_pose_cov: Floats
+    truth_pose: Floats
+
+    @property
+    def steps(self) -> int:
+        return len(self.odometry)
+
+    def sightings_at(self, step: int) -> Sightings:
+        """What was seen from pose `step`."""
+        low, high = np.searchsorted(self.sighting_step, [step, step + 1])
+        return Sightings(
+            z=self.sighting_z[low:high], cov=self.sighting_cov[low:high], signature=self.sighting_signature[low:high]
+        )
+
+    def readings(self) -> Iterator[Reading]:
+        """Steps 1 .. T; what was seen from pose 0 is `sightings_at(0)`."""
+        for k in range(1, self.steps + 1):
+            yield Reading(
+                time_s=float(self.time_s[k]),
+                odometry=self.odometry[k - 1],
+                odometry_cov=self.odometry_cov[k - 1],
+                sightings=self.sightings_at(k),
+            )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording:
+    """One run's readings by vehicle (in fleet order), and the true landmarks (m, 2), which may be unknown (0, 2).
+
+    skipped: sightings left out by the loader, by reason.
+    """
+
+    landmarks: Floats
+    logs: dict[str, Log]
+    skipped: dict[str, int]
