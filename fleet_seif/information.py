@@ -6,6 +6,7 @@
 4. Only the upper triangle is kept, blocks in row-major order: NaN and asymmetry cannot be written down.
 """
 
+import dataclasses
 import hashlib
 from dataclasses import dataclass
 from typing import Final
@@ -204,6 +205,10 @@ class FrameTotal:
             raise NumericalError(
                 "a frame total would exceed 2^60 quanta (H 2^-28, b 2^-24): the vehicle claims absurd information"
             )
+
+    def subtract(self, delta: FrameDelta) -> None:
+        """Take back one delta that was added."""
+        self.add(dataclasses.replace(delta, H=-delta.H, b=-delta.b))
 
     def _reserve(self, slots: int, values: int) -> None:
         if 2 * (self._used[0] + slots) > len(self._keys):

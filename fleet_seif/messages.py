@@ -1,0 +1,199 @@
+"""The records that travel between processes. `wire` writes and reads their bytes, FORMAT.md specifies them."""
+
+import re
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+from fleet_seif.information import FrameDelta
+from fleet_seif.records import Floats
+
+NAME_MAX: Final = 32
+_NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{NAME_MAX}}}")
+
+
+def check_name(name: str, what: str) -> str:
+    """The name itself, if it can be part of a key. Raises ValueError otherwise."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"{what} {name!r}: use 1 to {NAME_MAX} of the characters A-Z a-z 0-9 _ -")
+    return name
+
+
+class Epoch(NamedTuple):
+    """One run of a vehicle process: a durable counter and a random nonce."""
+
+    counter: int
+    nonce: int
+
+
+class FrameStatus(IntEnum):
+    """What a message does to a frame. ENDED: its last pose is now the next frame's start."""
+
+    OPENED = 0
+    CONTINUED = 1
+    ENDED = 2
+    CORRECTED = 3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FramePart:
+    """A message's share in one frame. end_pose: mean of the frame's end pose (3,), with ENDED and CORRECTED."""
+
+    frame: int
+    status: FrameStatus
+    delta: FrameDelta
+    end_pose: Floats | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Continues:
+    """The epoch that a new one continues: its last committed sequence number and the prefix digest there."""
+
+    epoch: Epoch
+    last: int
+    prefix_digest: bytes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Hello:
+    """What a vehicle says of itself in sequence 0.
+
+    start_pose (3,) and start_pose_cov (3, 3): T_0 in the world; a covariance of zeros means given; `placed` is False
+    where the start pose is not known. sighting_information_max: largest eigenvalue of any Z^-1 it will use, per m^2
+    or rad^2; sightings_max: most sightings a step.
+    """
+
+    software: str
+    life: int
+    placed: bool
+    start_pose: Floats
+    start_pose_cov: Floats
+    sighting_information_max: float
+    sightings_max: int
+    continues: Continues | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeltaMessage:
+    """What a vehicle's filter learned in the messages `first` .. `last` of an epoch.
+
+    step: index of the newest pose. time_s: the vehicle's own time, opaque. landmarks: (number, signature) of new ones;
+    aliases: (number, number, added). innovation, innovation_dof, refused: sum of normalised squares, its degrees of
+    freedom and the sightings refused, over the steps covered. end: the stream ends here.
+    """
+
+    fleet: str
+    vehicle: str
+    epoch: Epoch
+    first: int
+    last: int
+    step: int
+    time_s: float
+    parts: tuple[FramePart, ...]
+    landmarks: tuple[tuple[int, int], ...] = ()
+    aliases: tuple[tuple[int, int, bool], ...] = ()
+    healthy: bool = True
+    innovation: float = 0.0
+    innovation_dof: int = 0
+    refused: int = 0
+    hello: Hello | None = None
+    end: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heartbeat:
+    """The last message a vehicle has put, and the digest of the stream up to it."""
+
+    vehicle: str
+    epoch: Epoch
+    last: int
+    prefix_digest: bytes
+    ended: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ack:
+    """A node holds everything of a stream up to `last`."""
+
+    node: str
+    vehicle: str
+    epoch: Epoch
+    last: int
+    prefix_digest: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeRequest:
+    """Asks a vehicle for messages first .. last of an epoch, at most `count` of them."""
+
+    epoch: Epoch
+    first: int
+    last: int
+    count: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """Everything that folding the prefix 0 .. last leaves behind, as one message, with the digest of the prefix."""
+
+    message: DeltaMessage
+    prefix_digest: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleState:
+    """What a fusion node says of one vehicle.
+
+    epoch, cut: the last message folded. parked, duplicates, gaps_repaired, refused: messages waiting for an earlier
+    one, received again, obtained by asking, and rejected. behind: messages announced but not folded.
+    """
+
+    name: str
+    life: int
+    epoch: Epoch
+    cut: int
+    behind: int
+    parked: int
+    duplicates: int
+    gaps_repaired: int
+    refused: int
+    stalled: bool
+    ended: bool
+    healthy: bool
+
+
+class LandmarkName(NamedTuple):
+    """A vehicle's own name of a landmark: vehicle, life, number."""
+
+    vehicle: str
+    life: int
+    number: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JointMap:
+    """The fused map of a fleet.
+
+    version: grows with every map of a node. landmark_mean (n, 2) m; landmark_cov (n, 2, 2) m^2, empty (0, 2, 2) where
+    none has been computed yet; cov_version: the map version that the covariances belong to, -1 for none.
+    names: for each landmark, who saw it; signature (n,), -1 unknown. pose_mean (v, 3), pose_cov (v, 3, 3) in the
+    order of `poses`, the names of the placed vehicles. age_s: how old the newest message in it was when it was
+    solved. canonical: replayed in canonical order, and so equal on every node that holds the same messages.
+    """
+
+    fleet: str
+    version: int
+    canonical: bool
+    final: bool
+    map_digest: bytes
+    ledger_digest: bytes
+    landmark_mean: Floats
+    landmark_cov: Floats
+    cov_version: int
+    names: tuple[tuple[LandmarkName, ...], ...]
+    signature: tuple[int, ...]
+    poses: tuple[str, ...]
+    pose_mean: Floats
+    pose_cov: Floats
+    vehicles: tuple[VehicleState, ...]
+    counters: dict[str, int] = field(default_factory=dict)
