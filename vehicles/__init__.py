@@ -1,0 +1,5 @@
+"""The vehicle: a SEIF on its own odometry and sightings, publishing what it learned."""
+
+from vehicles.vehicle import Vehicle
+
+__all__ = ["Vehicle"]

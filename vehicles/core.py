@@ -47,6 +47,7 @@ class Counters:
     sightings_refused: int = 0
     acks_refused: int = 0
     messages: int = 0
+    bytes_put: int = 0
 
 
 class VehicleCore:
@@ -170,7 +171,9 @@ class VehicleCore:
 
     def release(self) -> list[bytes]:
         """Messages to put now, in order."""
-        return self.outbox.release()
+        released = self.outbox.release()
+        self.counters.bytes_put += sum(len(data) for data in released)
+        return released
 
     def on_ack(self, data: bytes) -> None:
         """An acknowledgement from a fusion node; what is not for this epoch is left alone."""

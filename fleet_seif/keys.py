@@ -1,0 +1,41 @@
+"""Where things are on the bus: `fleet_seif/1/<fleet>/...`."""
+
+from fleet_seif.messages import check_name
+
+ROOT = "fleet_seif/1"
+
+
+class Keys:
+    """Keys of one fleet. Raises ValueError for a name that cannot be part of a key."""
+
+    def __init__(self, fleet: str) -> None:
+        self._stem = f"{ROOT}/{check_name(fleet, 'fleet')}"
+
+    def deltas(self, vehicle: str) -> str:
+        """Deltas are put here; `*` for all vehicles."""
+        return f"{self._stem}/vehicle/{vehicle}/delta"
+
+    def heartbeats(self, vehicle: str) -> str:
+        return f"{self._stem}/vehicle/{vehicle}/heartbeat"
+
+    def outbox(self, vehicle: str) -> str:
+        """Answers range queries."""
+        return f"{self._stem}/vehicle/{vehicle}/outbox"
+
+    def alive(self, vehicle: str) -> str:
+        """Liveliness token."""
+        return f"{self._stem}/vehicle/{vehicle}/alive"
+
+    def acks(self, vehicle: str) -> str:
+        """Acknowledgements for a vehicle are put here."""
+        return f"{self._stem}/vehicle/{vehicle}/ack"
+
+    def map(self) -> str:
+        """Maps are put here in pieces, and queried whole."""
+        return f"{self._stem}/map"
+
+
+def vehicle_of(key: str) -> str:
+    """The vehicle in a key that names one, '' otherwise."""
+    parts = key.split("/")
+    return parts[4] if len(parts) > 4 and parts[3] == "vehicle" else ""

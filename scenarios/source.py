@@ -1,0 +1,33 @@
+"""Readings for a scenario: from its simulated world or its data set."""
+
+from scenarios import mrclam
+from scenarios.config import Scenario, ScenarioError
+from scenarios.recording import Recording
+from scenarios.world import simulate
+
+
+def vehicle_names(scenario: Scenario) -> tuple[str, ...]:
+    """The vehicles of a scenario, in fleet order."""
+    if scenario.dataset is not None:
+        return mrclam.robots(scenario.dataset)
+    return tuple(f"v{i + 1}" for i in range(scenario.fleet.vehicles))
+
+
+def record(scenario: Scenario, only: str | None = None) -> Recording:
+    """Every reading of a scenario's vehicles, or of one of them. The same arguments give the same readings.
+
+    Raises ScenarioError for a vehicle that does not take part or a data set that cannot be read.
+    """
+    if scenario.dataset is not None:
+        try:
+            return mrclam.load(scenario.dataset, only=only)
+        except mrclam.DatasetError as error:
+            raise ScenarioError(str(error)) from None
+    assert scenario.world is not None
+    names = vehicle_names(scenario)
+    recording = simulate(scenario.world, scenario.noise, names, scenario.run.seed)
+    if only is None:
+        return recording
+    if only not in recording.logs:
+        raise ScenarioError(f"no vehicle {only!r} in this scenario: its vehicles are {', '.join(names)}")
+    return Recording(landmarks=recording.landmarks, logs={only: recording.logs[only]}, skipped=recording.skipped)

@@ -1,0 +1,105 @@
+"""Drives a vehicle through a stream of readings and keeps what a report needs."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fleet_seif.errors import NumericalError, ReadingRefused, RunError
+from fleet_seif.records import Floats, Ints, Reading, Sightings
+from vehicles.vehicle import Vehicle
+
+log = logging.getLogger(__name__)
+SILENCE_S = 30.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DriveResult:
+    """What a vehicle has to say after its run.
+
+    pose (T+1, 3): live estimate after each step. landmarks (n, 2), signatures (n,): its own live map at the end.
+    filter_s, publish_s (T,): time spent on each step. bytes_put, messages: what it published.
+    readings_refused, sightings_refused: what its filter would not take.
+    """
+
+    pose: Floats
+    landmarks: Floats
+    signatures: Ints
+    filter_s: Floats
+    publish_s: Floats
+    bytes_put: int
+    messages: int
+    readings_refused: int
+    sightings_refused: int
+
+
+@dataclass
+class Notes:
+    """Collects a DriveResult step by step."""
+
+    pose: list[Floats] = field(default_factory=list)
+    filter_s: list[float] = field(default_factory=list)
+    publish_s: list[float] = field(default_factory=list)
+
+    def result(
+        self, landmarks: Floats, signatures: list[int], bytes_put: int, messages: int, readings: int, sightings: int
+    ) -> DriveResult:
+        """All of it, with what the vehicle counted."""
+        return DriveResult(
+            pose=np.array(self.pose).reshape(-1, 3),
+            landmarks=landmarks,
+            signatures=np.array(signatures, np.int64),
+            filter_s=np.array(self.filter_s),
+            publish_s=np.array(self.publish_s),
+            bytes_put=bytes_put,
+            messages=messages,
+            readings_refused=readings,
+            sightings_refused=sightings,
+        )
+
+
+def drive(
+    vehicle: Vehicle,
+    first: Sightings,
+    start_s: float,
+    readings: Iterator[Reading],
+    rate_hz: float,
+    on_step: Callable[[int], None] = lambda step: None,
+) -> DriveResult:
+    """Feed every reading, end the stream and wait until a fusion node holds all of it.
+
+    rate_hz: readings a second; 0: as fast as acknowledgements allow.
+
+    Raises RunError where nothing is acknowledged for SILENCE_S.
+    """
+    notes = Notes()
+    vehicle.start(first, time_s=start_s)
+    notes.pose.append(vehicle.pose)
+    begin = time.monotonic()
+    for step, reading in enumerate(readings, start=1):
+        if rate_hz:
+            time.sleep(max(0.0, begin + step / rate_hz - time.monotonic()))
+        elif not vehicle.wait_for_room(SILENCE_S):
+            raise _silence()
+        try:
+            vehicle.step(reading.odometry, reading.odometry_cov, reading.sightings, time_s=reading.time_s)
+        except (ReadingRefused, NumericalError) as error:
+            log.error("reading_refused step=%d reason=%s", step, error)
+        notes.pose.append(vehicle.pose)
+        notes.filter_s.append(vehicle.filter_s)
+        notes.publish_s.append(vehicle.publish_s)
+        on_step(step)
+    vehicle.end()
+    if not vehicle.wait_until_acknowledged(SILENCE_S):
+        raise _silence()
+    counters = vehicle.counters
+    return notes.result(
+        vehicle.landmarks, vehicle.signatures, counters.bytes_put, counters.messages,
+        counters.readings_refused, counters.sightings_refused,
+    )  # fmt: skip
+
+
+def _silence() -> RunError:
+    return RunError(f"no acknowledgement for {SILENCE_S:.0f} s: is the fusion node running and reachable?")

@@ -1,0 +1,212 @@
+"""The vehicle core in its shell: the one class for a robot of your own and for the vehicle process.
+
+1. With a bus, a thread of its own sends heartbeats, takes acknowledgements and answers range queries.
+2. Without one, everything else works; messages are kept (and coalesced) in the outbox.
+3. `step` never waits for the network; `wait_for_room` does, for those who want to.
+"""
+
+import queue
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fleet_seif.bus import Bus
+from fleet_seif.config import FilterSettings, PublishSettings
+from fleet_seif.keys import Keys
+from fleet_seif.messages import Epoch
+from fleet_seif.models import RANGE_BEARING
+from fleet_seif.records import Floats, Reading, Sightings
+from fleet_seif.seif import StepResult
+from vehicles.core import Counters, Identity, VehicleCore
+
+TICK_S = 0.05
+ACKS_MAX = 10_000
+
+
+class Vehicle:
+    """One vehicle: `step` it with odometry and sightings, read `pose` and `landmarks`.
+
+    Args:
+        name, fleet: who it is; 1 to 32 of the characters A-Z a-z 0-9 _ -.
+        start_pose: T_0 in the world, (x m, y m, theta rad).
+        start_pose_cov: its covariance, (3, 3); None: the start pose is given.
+        bus: an open bus (fleet_seif.bus.open_bus), or None to map alone.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        fleet: str = "fleet",
+        start_pose: ArrayLike = (0.0, 0.0, 0.0),
+        start_pose_cov: ArrayLike | None = None,
+        bus: Bus | None = None,
+        settings: FilterSettings | None = None,
+        publish: PublishSettings | None = None,
+        model: int = RANGE_BEARING,
+        epoch: Epoch | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        identity = Identity(
+            fleet=fleet,
+            vehicle=name,
+            epoch=epoch or Epoch(0, secrets.randbits(64)),
+            start_pose=np.asarray(start_pose, float),
+            start_pose_cov=np.zeros((3, 3)) if start_pose_cov is None else np.asarray(start_pose_cov, float),
+        )
+        self._core = VehicleCore(identity, settings or FilterSettings(), publish or PublishSettings(), model)
+        self._clock = clock
+        self._bus = bus
+        self._keys = Keys(fleet)
+        self._lock = threading.Lock()
+        self._acknowledged = threading.Condition(self._lock)
+        self._acks: queue.Queue[bytes | None] = queue.Queue(ACKS_MAX)
+        self._thread: threading.Thread | None = None
+        self.filter_s = 0.0
+        self.publish_s = 0.0
+        if bus is not None:
+            self._connect(bus)
+
+    def _connect(self, bus: Bus) -> None:
+        name = self._core.identity.vehicle
+        bus.subscribe(self._keys.acks(name), lambda _, data: self._put_ack(data))
+        bus.answer(self._keys.outbox(name), lambda _, data: self._on_range(data))
+        bus.announce(self._keys.alive(name))
+        self._thread = threading.Thread(target=self._serve, name=f"vehicle-{name}", daemon=True)
+        self._thread.start()
+
+    def _put_ack(self, data: bytes) -> None:
+        if not self._acks.full():  # a later acknowledgement says all that a dropped one said
+            self._acks.put_nowait(data)
+
+    def _on_range(self, data: bytes) -> list[bytes]:
+        with self._lock:
+            return self._core.on_range(data)
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                data = self._acks.get(timeout=TICK_S)
+            except queue.Empty:
+                data = b""
+            if data is None:
+                return
+            with self._lock:
+                if data:
+                    self._core.on_ack(data)
+                    self._acknowledged.notify_all()
+                self._publish()
+                heartbeat = self._core.tick(self._clock())
+            if heartbeat is not None and self._bus is not None:
+                self._bus.put(self._keys.heartbeats(self._core.identity.vehicle), heartbeat)
+
+    def _publish(self) -> None:
+        """Put what may be put; the caller holds the lock, so that messages leave in order."""
+        if self._bus is not None:
+            for data in self._core.release():
+                self._bus.put(self._keys.deltas(self._core.identity.vehicle), data)
+
+    def start(self, sightings: Sightings | None = None, *, time_s: float | None = None) -> StepResult:
+        """Say hello, with what is seen before any motion. `step` does it with nothing seen if you do not."""
+        with self._lock:
+            result = self._core.start(self._time(time_s), sightings or Sightings.none())
+            self._publish()
+            return result
+
+    def step(
+        self,
+        odometry: ArrayLike,
+        odometry_cov: ArrayLike,
+        sightings: Sightings | None = None,
+        *,
+        time_s: float | None = None,
+    ) -> StepResult:
+        """Move, then look around.
+
+        Args:
+            odometry: pose increment (dx m, dy m, dtheta rad) in the frame of the pose it leaves.
+            odometry_cov: its covariance, (3, 3), positive definite.
+            sightings: what is seen from the new pose.
+            time_s: the vehicle's own time, growing; None: this machine's monotonic clock.
+
+        Raises:
+            ReadingRefused: the reading is malformed or late; nothing has changed.
+            NumericalError: the filter cannot take it; nothing has changed but the vehicle's health.
+        """
+        reading = Reading(
+            time_s=self._time(time_s),
+            odometry=np.ascontiguousarray(odometry, float),
+            odometry_cov=np.ascontiguousarray(odometry_cov, float),
+            sightings=sightings or Sightings.none(),
+        )
+        with self._lock:
+            begin = time.perf_counter()
+            if self._core.outbox.last < 0:
+                self._core.start(np.nextafter(reading.time_s, -np.inf), Sightings.none())
+            result = self._core.step(reading)
+            middle = time.perf_counter()
+            self._publish()
+            self.filter_s, self.publish_s = middle - begin, time.perf_counter() - middle
+            return result
+
+    def _time(self, time_s: float | None) -> float:
+        return self._clock() if time_s is None else time_s
+
+    def end(self) -> None:
+        """End the stream; the map stays."""
+        with self._lock:
+            self._core.end()
+            self._publish()
+
+    def wait_for_room(self, timeout_s: float | None = None) -> bool:
+        """Wait until fewer than `publish.window` messages are unacknowledged. False after the timeout."""
+        with self._lock:
+            return self._acknowledged.wait_for(lambda: not self._core.outbox.full, timeout_s)
+
+    def wait_until_acknowledged(self, timeout_s: float | None = None) -> bool:
+        """Wait until the stream has ended and a fusion node holds all of it. False after the timeout."""
+        with self._lock:
+            return self._acknowledged.wait_for(lambda: self._core.done, timeout_s)
+
+    @property
+    def pose(self) -> Floats:
+        """Live estimate of the pose in the world (x m, y m, theta rad), shape (3,)."""
+        with self._lock:
+            return self._core.pose
+
+    @property
+    def landmarks(self) -> Floats:
+        """Live estimates of the landmarks in the world, m, shape (n, 2)."""
+        with self._lock:
+            return self._core.landmarks
+
+    @property
+    def signatures(self) -> list[int]:
+        """The signature of each landmark, in the same order."""
+        with self._lock:
+            return list(self._core.filter.signatures)
+
+    @property
+    def counters(self) -> Counters:
+        """What has been counted so far."""
+        return self._core.counters
+
+    def close(self) -> None:
+        """Stop the thread. The bus is the caller's to close."""
+        if self._thread is not None:
+            self._acks.put(None)
+            self._thread.join()
+            self._thread = None
+
+    def __enter__(self) -> "Vehicle":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
