@@ -51,9 +51,7 @@ def solve_upper_into(v: Floats, L: Floats, n: int) -> None:
 def inverse_2x2(A: Floats) -> Floats:
     """Inverse of a 2 x 2 matrix; not finite where A is singular."""
     determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-    return np.array(
-        [[A[1, 1] / determinant, -A[0, 1] / determinant], [-A[1, 0] / determinant, A[0, 0] / determinant]]
-    )
+    return np.array([[A[1, 1] / determinant, -A[0, 1] / determinant], [-A[1, 0] / determinant, A[0, 0] / determinant]])
 
 
 @kernel

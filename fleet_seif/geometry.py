@@ -19,7 +19,7 @@ def wrap(angle: float) -> float:
     """The angle in [-pi, pi] that differs from `angle` (rad) by a multiple of 2 pi (math.remainder's rule)."""
     if -math.pi <= angle <= math.pi:
         return angle
-    return angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))
+    return float(angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi)))
 
 
 @kernel
@@ -79,7 +79,8 @@ def act(T_ab: Floats, p_b: Floats) -> Floats:
 def act_all(T_ab: Floats, p_b: Floats) -> Floats:
     """`act` on every row of p_b, shape (n, 2)."""
     c, s = math.cos(T_ab[2]), math.sin(T_ab[2])
-    return p_b @ np.array([[c, s], [-s, c]]) + T_ab[:2]
+    p_a: Floats = p_b @ np.array([[c, s], [-s, c]]) + T_ab[:2]
+    return p_a
 
 
 @kernel

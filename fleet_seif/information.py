@@ -144,9 +144,7 @@ def _export(keys: Ints, offsets: Ints, values: Ints, order: Ints) -> tuple[Ints,
 
 
 @kernel
-def _triplets(
-    variables: Ints, rows: Ints, cols: Ints, H: Ints, offsets: Ints
-) -> tuple[Ints, Ints, Floats]:
+def _triplets(variables: Ints, rows: Ints, cols: Ints, H: Ints, offsets: Ints) -> tuple[Ints, Ints, Floats]:
     """Full symmetric (i, j, value) triplets of the blocks; rows, cols and offsets index `variables`."""
     count = 0
     for k in range(len(rows)):

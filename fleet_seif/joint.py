@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
+from numpy.typing import NDArray
 
 from fleet_seif.errors import NumericalError
 from fleet_seif.geometry import act_all, between, between_jacobians, compose
@@ -121,7 +122,7 @@ def _rows_of_poses(lives: Sequence[Life], first: int) -> tuple[list[tuple[str, i
 
 def _frame_mean(info: FrameInformation) -> Floats:
     """The frame's own solution, shape (n,)."""
-    return _factor(info.H).solve(info.b)
+    return _Factor(info.H).solve(info.b)
 
 
 class _Factor:
@@ -142,10 +143,6 @@ class _Factor:
 
     def solve(self, b: Floats) -> Floats:
         return np.asarray(self._lu.solve(np.asarray(b, float)))
-
-
-def _factor(H: scipy.sparse.csr_array) -> _Factor:
-    return _Factor(H)
 
 
 def _start_state(
@@ -188,7 +185,10 @@ def _expected(frame: _Frame, x: Floats) -> tuple[Floats, scipy.sparse.csr_array]
     J_start, J_end = between_jacobians(start, end)
     rotation = np.array([[c, s], [-s, c]])
     i = [np.repeat(np.arange(3), 3), 3 + np.repeat(np.arange(2 * count), 2)]
-    j = [frame.end_row + np.tile(np.arange(3), 3), (frame.landmark_rows[:, None, None] + np.array([[0, 1]] * 2)).ravel()]
+    j = [
+        frame.end_row + np.tile(np.arange(3), 3),
+        (frame.landmark_rows[:, None, None] + np.array([[0, 1]] * 2)).ravel(),
+    ]
     v = [J_end.ravel(), np.tile(rotation.ravel(), count)]
     if not given:
         J_points = np.empty((2 * count, 3))
@@ -203,9 +203,9 @@ def _expected(frame: _Frame, x: Floats) -> tuple[Floats, scipy.sparse.csr_array]
     return z, J
 
 
-def assemble(frames: Sequence[tuple[int, _Frame]], priors: Sequence[tuple[int, Floats, Floats]], x: Floats) -> (
-    tuple[scipy.sparse.csr_array, Floats]
-):
+def assemble(
+    frames: Sequence[tuple[int, _Frame]], priors: Sequence[tuple[int, Floats, Floats]], x: Floats
+) -> tuple[scipy.sparse.csr_array, Floats]:
     """H and gradient g of the joint system linearised at x. priors: (row, mean, information) of start poses."""
     pieces = [_expected(frame, x) for _, frame in frames]
     J = scipy.sparse.vstack([J for _, J in pieces], format="csr")
@@ -256,7 +256,7 @@ def solve(lives: Sequence[Life], classes: tuple[tuple[LandmarkName, ...], ...]) 
     linear = not priors and all(len(life.frames) == 1 for life in lives)
     for _ in range(ITERATIONS_MAX):
         H, g = assemble(frames, priors, x)
-        step = _factor(H).solve(g)
+        step = _Factor(H).solve(g)
         x = x + step
         if linear or float(step @ (H @ step)) < STEP_TOLERANCE * size:
             break
@@ -277,7 +277,7 @@ def solve(lives: Sequence[Life], classes: tuple[tuple[LandmarkName, ...], ...]) 
 
 def marginal_covariances(solution: JointSolution) -> tuple[Floats, Floats]:
     """Exact marginals P_ii of every landmark (n, 2, 2) m^2 and pose (p, 3, 3), from one factor and blocks of columns."""
-    factor = _factor(solution.H)
+    factor = _Factor(solution.H)
     n, p = len(solution.classes), len(solution.poses)
     size = 2 * n + 3 * p
     landmarks, poses = np.empty((n, 2, 2)), np.empty((p, 3, 3))
@@ -297,16 +297,22 @@ def marginal_covariances(solution: JointSolution) -> tuple[Floats, Floats]:
     return (landmarks + landmarks.transpose(0, 2, 1)) / 2, (poses + poses.transpose(0, 2, 1)) / 2
 
 
-def landmark_chi_square(solution: JointSolution, error: Floats) -> float:
-    """d' P^-1 d with the joint covariance P of all landmarks; error d (n, 2), m.
+def landmark_chi_square(solution: JointSolution, error: Floats, chosen: NDArray[np.bool_] | None = None) -> float:
+    """d' P^-1 d with the joint covariance P of the chosen landmarks (all by default).
 
-    P^-1 is the Schur complement of the poses: P^-1 = H_ll - H_lp H_pp^-1 H_pl.
+    P^-1 is the Schur complement of all other variables: H_cc - H_co H_oo^-1 H_oc.
+
+    Args:
+        error: d, shape (k, 2), m, one row for each chosen landmark.
+        chosen: which landmarks, shape (n,).
     """
-    n = 2 * len(solution.classes)
+    n = len(solution.classes)
+    rows = np.zeros(len(solution.mean), bool)
+    rows[: 2 * n] = True if chosen is None else np.repeat(chosen, 2)
+    inner, outer = np.flatnonzero(rows), np.flatnonzero(~rows)
     d = error.ravel()
-    H = solution.H
-    value = float(d @ (H[:n, :n] @ d))
-    if H.shape[0] > n:
-        pulled = H[n:, :n] @ d
-        value -= float(pulled @ _factor(scipy.sparse.csr_array(H[n:, n:])).solve(pulled))
+    value = float(d @ (solution.H[inner][:, inner] @ d))
+    if len(outer):
+        pulled = solution.H[outer][:, inner] @ d
+        value -= float(pulled @ _Factor(solution.H[outer][:, outer]).solve(pulled))
     return value

@@ -62,12 +62,10 @@ def motion_update_into(H: Floats, b: Floats, mu: Floats, model: int, u: Floats, 
 
 
 @kernel
-def measurement_update_into(
-    H: Floats, b: Floats, mu: Floats, model: int, z: Floats, Z: Floats, at: int
-) -> None:
+def measurement_update_into(H: Floats, b: Floats, mu: Floats, model: int, z: Floats, Z: Floats, at: int) -> None:
     """Eq. (17), (18): one sighting of the landmark whose rows start at `at`.
 
-        H += J' Z^-1 J,   b += J' Z^-1 (z - h(mu) + J mu)
+    H += J' Z^-1 J,   b += J' Z^-1 (z - h(mu) + J mu)
     """
     h, J_z_x, J_z_y = sight(model, mu[:3], mu[at : at + 2])
     r = innovation(model, z, h)
@@ -90,9 +88,7 @@ def measurement_update_into(
 
 
 @kernel
-def squared_innovation(
-    L: Floats, known: int, mu: Floats, model: int, z: Floats, Z: Floats, at: int
-) -> float:
+def squared_innovation(L: Floats, known: int, mu: Floats, model: int, z: Floats, Z: Floats, at: int) -> float:
     """r' S^-1 r with S = J H^-1 J' + Z of one sighting; L is the lower factor of H's leading `known` rows.
 
     H^-1 is that of the block, given the rest of the map, so S is at most the full innovation covariance.

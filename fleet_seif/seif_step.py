@@ -238,9 +238,7 @@ def quantise(H: Floats, b: Floats, mu: Floats, entries: Ints) -> tuple[Ints, Int
 
 
 @kernel
-def block_delta(
-    ids: Ints, q_H: Ints, q_b: Ints, old_H: Ints, old_b: Ints
-) -> tuple[Ints, Ints, Ints, Ints, Ints]:
+def block_delta(ids: Ints, q_H: Ints, q_b: Ints, old_H: Ints, old_b: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
     """What changed in a block: the arrays of a FrameDelta, blocks and variables that did not change left out."""
     m = len(ids) + 1
     pairs = m * (m + 1) // 2
@@ -303,9 +301,7 @@ def published(s: SeifArrays, ids: Ints, links: Ints) -> tuple[Ints, Ints]:
 
 
 @kernel
-def scatter(
-    s: SeifArrays, ids: Ints, links: Ints, H: Floats, b: Floats, mu: Floats, q_H: Ints, q_b: Ints
-) -> None:
+def scatter(s: SeifArrays, ids: Ints, links: Ints, H: Floats, b: Floats, mu: Floats, q_H: Ints, q_b: Ints) -> None:
     """Write a block back."""
     s.H_xx[:], s.b_x[:], s.mu_x[:] = H[:3, :3], b[:3], mu[:3]
     s.q_xx[:], s.q_b_x[:] = q_H[:3, :3], q_b[:3]
@@ -402,9 +398,7 @@ def seif_step(
     if moves:
         motion_update_into(H, b, mu, model, u, cov)
     at = 3 + 2 * np.searchsorted(ids, sighted)
-    accepted, statistics[0], used, definite = accept_sightings(
-        s, H, mu, ids, model, at, z, Z, gate, patience, refusals
-    )
+    accepted, statistics[0], used, definite = accept_sightings(s, H, mu, ids, model, at, z, Z, gate, patience, refusals)
     if not definite:
         return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
     statistics[1], statistics[2] = used, len(z) - np.sum(accepted)

@@ -145,7 +145,11 @@ class FusionCore:
         """The acknowledgement of all that is folded of a stream, whatever has been sent before."""
         stream = self.ledger.stream(vehicle, epoch)
         ack = Ack(
-            node=self._node, vehicle=vehicle, epoch=epoch, last=max(stream.next - 1, 0), prefix_digest=stream.prefix_digest
+            node=self._node,
+            vehicle=vehicle,
+            epoch=epoch,
+            last=max(stream.next - 1, 0),
+            prefix_digest=stream.prefix_digest,
         )
         return PutAck(vehicle, encode_ack(ack))
 

@@ -47,7 +47,12 @@ class FusionService:
     """See the rules above."""
 
     def __init__(
-        self, bus: Bus, core: FusionCore, fleet: str, settings: FusionSettings, clock: Callable[[], float] = time.monotonic
+        self,
+        bus: Bus,
+        core: FusionCore,
+        fleet: str,
+        settings: FusionSettings,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bus = bus
         self._core = core

@@ -153,9 +153,7 @@ class VehicleCore:
         if self.outbox.last < 0:
             raise ReadingRefused("the vehicle has not started: there is nothing to end")
         self.ended = True
-        part = FramePart(
-            frame=0, status=FrameStatus.ENDED, delta=FrameDelta.nothing(), end_pose=self.filter.pose
-        )
+        part = FramePart(frame=0, status=FrameStatus.ENDED, delta=FrameDelta.nothing(), end_pose=self.filter.pose)
         self._send(time_s=self._time_s, parts=(part,), end=True)
 
     def _send(self, **fields: object) -> None:

@@ -1,0 +1,78 @@
+"""The joint map as it was at chosen times: the ledger's messages folded again, up to each time, and solved."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet_seif.errors import NumericalError
+from fleet_seif.joint import JointSolution, landmark_classes, marginal_covariances, solve
+from fleet_seif.records import Floats
+from fleet_seif.wire import KIND_SNAPSHOT, decode_message, decode_snapshot, kind_of
+from fusion.ledger import Ledger
+from fusion.mapping import lives_of
+from scenarios.recording import Log, Recording
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Moment:
+    """The joint map at one time, s. landmark_cov (n, 2, 2) m^2."""
+
+    time_s: float
+    solution: JointSolution
+    landmark_cov: Floats
+
+    @property
+    def uncertainty_m2(self) -> float:
+        """Sum of the traces of all landmarks' covariances."""
+        return float(np.trace(self.landmark_cov, axis1=1, axis2=2).sum())
+
+
+def message_time_s(data: bytes) -> float:
+    """The vehicle's time in an encoded message or snapshot."""
+    message = decode_snapshot(data).message if kind_of(data) == KIND_SNAPSHOT else decode_message(data)
+    return message.time_s
+
+
+def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
+    """The joint map at ascending times: the cut of all messages that are not later. Times before the first are left out."""
+    again = Ledger(ledger.fleet, 1)
+    waiting = sorted(
+        ((message_time_s(data), i, data) for stream in ledger.placed() for i, data in enumerate(stream.log)),
+        key=lambda item: item[:2],
+    )
+    at = 0
+    for time_s in times_s:
+        while at < len(waiting) and waiting[at][0] <= time_s:
+            again.accept(waiting[at][2])
+            at += 1
+        lives = lives_of(again)
+        classes = landmark_classes(lives)
+        if not classes:
+            continue
+        try:
+            solution = solve(lives, classes)
+        except NumericalError:
+            continue
+        yield Moment(time_s=time_s, solution=solution, landmark_cov=marginal_covariances(solution)[0])
+
+
+def shared_since(a: Log, b: Log) -> float | None:
+    """The first time at which two vehicles have seen one landmark (by truth), s; None if they never have."""
+    first_a, first_b = _first_seen(a), _first_seen(b)
+    times = [max(first_a[truth], first_b[truth]) for truth in first_a.keys() & first_b.keys()]
+    return min(times) if times else None
+
+
+def _first_seen(log: Log) -> dict[int, float]:
+    known = log.sighting_truth >= 0
+    truths, at = np.unique(log.sighting_truth[known], return_index=True)
+    times = log.time_s[log.sighting_step[known][at]]
+    return dict(zip(truths.tolist(), times.tolist(), strict=True))
+
+
+def meetings(recording: Recording) -> list[tuple[str, str, float]]:
+    """Pairs of vehicles that share landmarks, and since when, s; earliest first."""
+    logs = list(recording.logs.values())
+    found = [(a.vehicle, b.vehicle, shared_since(a, b)) for i, a in enumerate(logs) for b in logs[i + 1 :]]
+    return sorted(((a, b, t) for a, b, t in found if t is not None), key=lambda item: item[2])

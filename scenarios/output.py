@@ -1,0 +1,133 @@
+"""What a run leaves in its folder; the README documents it as FORMAT below."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_seif.errors import RunError
+from fleet_seif.joint import JointSolution
+from fleet_seif.records import Floats, Ints
+from fusion.ledger import Ledger
+from scenarios.recording import Log, Recording
+from vehicles.drive import DriveResult
+
+FORMAT: Final = 1
+PARKED_MAX: Final = 1
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make the folder and its parts. Raises RunError where that cannot be."""
+    try:
+        for part in ("readings", "trajectory", "process"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"cannot write to {folder}: {error.strerror or error}; give another --out DIR") from None
+
+
+def write_readings(folder: Path, log: Log) -> None:
+    """readings/<vehicle>.npz: exactly what the filter was fed."""
+    np.savez_compressed(
+        folder / "readings" / f"{log.vehicle}.npz",
+        time_s=log.time_s,
+        odometry=log.odometry,
+        odometry_cov=log.odometry_cov,
+        sighting_step=log.sighting_step,
+        sighting_range_m=log.sighting_z[:, 0],
+        sighting_bearing_rad=log.sighting_z[:, 1],
+        sighting_cov=log.sighting_cov,
+        sighting_signature=log.sighting_signature,
+        sighting_truth=log.sighting_truth,
+        start_pose=log.start_pose,
+        start_pose_cov=log.start_pose_cov,
+    )
+
+
+def write_truth(folder: Path, recording: Recording) -> None:
+    """truth.npz: landmarks, and each vehicle's true poses (NaN where unknown)."""
+    poses = {f"pose_{name}": log.truth_pose for name, log in recording.logs.items()}
+    np.savez_compressed(folder / "truth.npz", landmarks=recording.landmarks, **poses)
+
+
+def write_trajectory(path: Path, time_s: Floats, poses: Floats) -> None:
+    """TUM format, one pose a line: time x y z qx qy qz qw. Poses that are not finite are left out."""
+    known = np.all(np.isfinite(poses), axis=1)
+    x, y, theta = poses[known].T
+    zero = np.zeros(len(x))
+    table = np.column_stack([time_s[known], x, y, zero, zero, zero, np.sin(theta / 2), np.cos(theta / 2)])
+    np.savetxt(path, table, fmt="%.9f")
+
+
+def write_map(folder: Path, solution: JointSolution, landmark_cov: Floats, landmark_truth: Ints) -> None:
+    """map.npz and map.json: the canonical map with its joint system."""
+    newest = [i for i, (_, _, k) in enumerate(solution.poses) if k < 0]
+    vehicles = [solution.poses[i][0] for i in newest]
+    H = solution.H.tocsr()
+    H.sort_indices()
+    np.savez_compressed(
+        folder / "map.npz",
+        landmark_mean=solution.landmark_mean,
+        landmark_cov=landmark_cov,
+        landmark_truth=landmark_truth,
+        vehicles=np.array(vehicles, dtype=np.str_),
+        pose_mean=solution.pose_mean[newest],
+        H_data=H.data,
+        H_indices=H.indices,
+        H_indptr=H.indptr,
+        b=solution.b,
+        variables=np.array(solution.variables(), dtype=np.str_),
+    )
+    landmarks = [
+        {
+            "mean_m": mean.tolist(),
+            "cov_m2": cov.tolist(),
+            "truth": int(truth),
+            "signature": signature,
+            "seen_by": [f"{name.vehicle}/{name.life}/{name.number}" for name in names],
+        }
+        for mean, cov, truth, signature, names in zip(
+            solution.landmark_mean, landmark_cov, landmark_truth, solution.signatures, solution.classes, strict=True
+        )
+    ]
+    poses = {vehicle: solution.pose_mean[i].tolist() for vehicle, i in zip(vehicles, newest, strict=True)}
+    write_json(folder / "map.json", {"format": FORMAT, "landmarks": landmarks, "poses": poses})
+
+
+def write_json(path: Path, value: Mapping[str, object]) -> None:
+    """JSON for people and programs, two spaces deep."""
+    path.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def write_ledger(path: Path, ledger: Ledger) -> None:
+    """Every folded message, each behind its length (4 bytes, little-endian), stream by stream."""
+    with path.open("wb") as file:
+        for stream in ledger.streams.values():
+            for data in stream.log:
+                file.write(len(data).to_bytes(4, "little") + data)
+
+
+def read_ledger(path: Path, fleet: str) -> Ledger:
+    """The ledger from such a file, folded anew."""
+    ledger = Ledger(fleet, PARKED_MAX)
+    data = path.read_bytes()
+    at = 0
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        ledger.accept(data[at + 4 : at + 4 + size])
+        at += 4 + size
+    return ledger
+
+
+def write_drive(path: Path, result: DriveResult) -> None:
+    """What a vehicle process hands to the launcher."""
+    np.savez(path, **{name: np.asarray(value) for name, value in vars(result).items()})
+
+
+def read_drive(path: Path) -> DriveResult:
+    """The same, read back."""
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    counts = ("bytes_put", "messages", "readings_refused", "sightings_refused")
+    return DriveResult(**{name: int(value) if name in counts else value for name, value in arrays.items()})

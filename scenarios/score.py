@@ -1,0 +1,127 @@
+"""Scores a finished run against the truth. What has no truth is None."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet_seif.joint import JointSolution, landmark_chi_square
+from fleet_seif.records import Floats, Ints
+from scenarios.recording import Log, Recording
+from vehicles.drive import DriveResult
+
+
+def rmse(error: Floats) -> float | None:
+    """Root mean square of the rows' lengths, m; None without rows."""
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) if len(error) else None
+
+
+def align(points: Floats, truth: Floats) -> Floats:
+    """The points after the rotation and translation that bring them nearest to the truth (least squares), (n, 2)."""
+    if len(points) < 2:
+        return truth.copy()
+    p, q = points - points.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, V = np.linalg.svd(p.T @ q)
+    D = np.diag([1.0, np.sign(np.linalg.det(U @ V))])
+    return p @ U @ D @ V + truth.mean(axis=0)
+
+
+def signature_truth(log: Log) -> dict[int, int]:
+    """Truth of each landmark of a vehicle, by signature: the majority of its sightings' truth."""
+    truths = {}
+    for signature in np.unique(log.sighting_signature).tolist():
+        values, counts = np.unique(log.sighting_truth[log.sighting_signature == signature], return_counts=True)
+        truths[signature] = int(values[np.argmax(counts)])
+    return truths
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MapScore:
+    """The joint map against the truth; see the README for the fields of report.json that have the same names."""
+
+    landmark_truth: Ints
+    landmark_rmse_m: float | None
+    landmark_rmse_aligned_m: float | None
+    nees_per_dof: float | None
+    nees_per_landmark: float | None
+    truth_landmarks: int
+    fused_landmarks: int
+    matched_landmarks: int
+    merges: int
+    wrong_merges: int
+    missed_merges: int
+
+
+def score_map(solution: JointSolution, landmark_cov: Floats, recording: Recording) -> MapScore:
+    """Errors, consistency and merges of a joint map. landmark_cov (n, 2, 2), m^2."""
+    truths = {name: signature_truth(log) for name, log in recording.logs.items()}
+    member_truth = [
+        [truths[name.vehicle].get(signature, -1) for name in names]
+        for names, signature in zip(solution.classes, solution.signatures, strict=True)
+    ]
+    landmark_truth = np.array([_majority(values) for values in member_truth], np.int64)
+    matched = landmark_truth >= 0
+    truth = recording.landmarks[landmark_truth[matched]]
+    mean, cov = solution.landmark_mean[matched], landmark_cov[matched]
+    error = mean - truth
+    nees = np.array([d @ np.linalg.solve(P, d) / 2 for d, P in zip(error, cov, strict=True)])
+    merges, wrong, missed = _merges(solution, member_truth)
+    seen = {t for log in recording.logs.values() for t in np.unique(log.sighting_truth).tolist() if t >= 0}
+    some = bool(np.any(matched))
+    return MapScore(
+        landmark_truth=landmark_truth,
+        landmark_rmse_m=rmse(error),
+        landmark_rmse_aligned_m=rmse(align(mean, truth) - truth) if some else None,
+        nees_per_dof=landmark_chi_square(solution, error, matched) / (2 * len(error)) if some else None,
+        nees_per_landmark=float(nees.mean()) if some else None,
+        truth_landmarks=len(seen),
+        fused_landmarks=len(solution.classes),
+        matched_landmarks=len(set(landmark_truth[matched].tolist())),
+        merges=merges,
+        wrong_merges=wrong,
+        missed_merges=missed,
+    )
+
+
+def _majority(values: list[int]) -> int:
+    known = [value for value in values if value >= 0]
+    return max(sorted(set(known)), key=known.count) if known else -1
+
+
+def _merges(solution: JointSolution, member_truth: list[list[int]]) -> tuple[int, int, int]:
+    """Over pairs of different vehicles' landmarks: merged, merged wrongly, not merged though one in truth."""
+    members = [
+        (c, name.vehicle, truth)
+        for c, (names, truths) in enumerate(zip(solution.classes, member_truth, strict=True))
+        for name, truth in zip(names, truths, strict=True)
+    ]
+    merges = wrong = 0
+    for c in range(len(solution.classes)):
+        group = [m for m in members if m[0] == c] if len(solution.classes[c]) > 1 else []
+        pairs = [(a, b) for i, a in enumerate(group) for b in group[i + 1 :] if a[1] != b[1]]
+        merges += len(pairs)
+        wrong += sum(a[2] != b[2] for a, b in pairs)
+    by_truth: dict[int, list[tuple[int, str, int]]] = {}
+    for member in members:
+        if member[2] >= 0:
+            by_truth.setdefault(member[2], []).append(member)
+    missed = sum(
+        a[0] != b[0] and a[1] != b[1]
+        for group in by_truth.values()
+        for i, a in enumerate(group)
+        for b in group[i + 1 :]
+    )
+    return merges, wrong, missed
+
+
+def score_vehicle(result: DriveResult, log: Log, landmarks: Floats) -> Mapping[str, float | None]:
+    """A vehicle's own live map and pose against the truth."""
+    truths = signature_truth(log)
+    truth = np.array([truths.get(signature, -1) for signature in result.signatures.tolist()], np.int64)
+    known = truth >= 0
+    with_truth = np.all(np.isfinite(log.truth_pose), axis=1)
+    pose_error = result.pose[with_truth, :2] - log.truth_pose[with_truth, :2]
+    return {
+        "landmark_rmse_m": rmse(result.landmarks[known] - landmarks[truth[known]]),
+        "pose_rmse_m": rmse(pose_error),
+    }
