@@ -72,7 +72,7 @@ def check_endpoints(endpoints: Sequence[str], insecure: bool) -> None:
         if not (insecure or is_loopback(endpoint) or protocol in ("tls", "quic")):
             raise RunError(
                 f"endpoint {endpoint!r} is not loopback and not encrypted: anybody there could write into the map. "
-                "Use tls/HOST:PORT with certificates in a --config file, or say --insecure if the network is yours alone"
+                "Use tls/HOST:PORT with certificates in a --config file, or --insecure if the network is yours"
             )
 
 

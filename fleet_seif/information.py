@@ -120,8 +120,8 @@ def _rehash(keys: Ints, offsets: Ints, new_keys: Ints, new_offsets: Ints) -> Non
 
 
 @kernel
-def _export(keys: Ints, offsets: Ints, values: Ints, order: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
-    """Non-zero blocks and vectors in canonical order: block rows, cols, values; vector variables, values; all values."""
+def _export(keys: Ints, offsets: Ints, values: Ints, order: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
+    """Non-zero blocks and vectors, slots in `order`: block rows, cols, values; vector variables, values."""
     rows, cols = np.empty(len(order), np.int64), np.empty(len(order), np.int64)
     H, names, b = np.empty(6 * len(order), np.int64), np.empty(len(order), np.int64), np.empty(3 * len(order), np.int64)
     n = h = v = w = 0
@@ -140,7 +140,7 @@ def _export(keys: Ints, offsets: Ints, values: Ints, order: Ints) -> tuple[Ints,
                 rows[n], cols[n] = row, col
                 H[h : h + size] = values[at : at + size]
                 n, h = n + 1, h + size
-    return rows[:n].copy(), cols[:n].copy(), H[:h].copy(), names[:v].copy(), b[:w].copy(), order
+    return rows[:n].copy(), cols[:n].copy(), H[:h].copy(), names[:v].copy(), b[:w].copy()
 
 
 @kernel
@@ -225,7 +225,7 @@ class FrameTotal:
         """The whole total as one delta from nothing, without blocks that are zero, in canonical order."""
         taken = np.flatnonzero(self._keys != -1)
         order = taken[np.argsort(self._keys[taken])]
-        rows, cols, H, names, b, _ = _export(self._keys, self._offsets, self._values, order)
+        rows, cols, H, names, b = _export(self._keys, self._offsets, self._values, order)
         variables = np.unique(np.concatenate([rows, cols, names]))
         full_b = np.zeros(row_offsets(variables)[-1], np.int64)
         starts = row_offsets(variables)[np.searchsorted(variables, names)]
@@ -260,7 +260,7 @@ def to_information(delta: FrameDelta) -> FrameInformation:
     n = int(offsets[-1])
     i, j, value = _triplets(delta.variables, delta.rows, delta.cols, delta.H, offsets)
     H = scipy.sparse.coo_array((value, (i, j)), shape=(n, n)).tocsr()
-    return FrameInformation(variables=delta.variables, offsets=offsets, H=H, b=delta.b * B_QUANTUM)
+    return FrameInformation(variables=delta.variables, offsets=offsets, H=H, b=delta.b.astype(np.float64) * B_QUANTUM)
 
 
 def delta_digest(delta: FrameDelta) -> bytes:

@@ -36,7 +36,7 @@ COLUMNS_AT_ONCE: Final = 512
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Life:
-    """What one life of a vehicle has contributed. frames: cumulative deltas of frames 0, 1, ...; signatures by number."""
+    """What one life of a vehicle has contributed: cumulative deltas of frames 0, 1, ...; signatures by number."""
 
     vehicle: str
     life: int
@@ -148,7 +148,7 @@ class _Factor:
 def _start_state(
     lives: Sequence[Life], frames: Sequence[tuple[int, _Frame]], rows: dict[tuple[int, int], int], size: int
 ) -> Floats:
-    """First estimate: every frame's own mean, carried through the frame poses; the first frame to see a landmark wins."""
+    """First estimate: each frame's own mean, carried through the frame poses; the first to see a landmark wins."""
     x, seen = np.zeros(size), np.zeros(size, bool)
     pose = np.zeros(3)
     frame_number = 0
@@ -247,8 +247,8 @@ def solve(lives: Sequence[Life], classes: tuple[tuple[LandmarkName, ...], ...]) 
             frames.append((i, frame))
     if not frames:
         raise NumericalError("nothing to solve: no vehicle has contributed anything yet")
-    priors = [
-        (rows[i, 0], np.asarray(life.start_pose, float), np.linalg.inv(life.start_pose_cov))
+    priors: list[tuple[int, Floats, Floats]] = [
+        (rows[i, 0], np.asarray(life.start_pose, float), np.linalg.inv(np.asarray(life.start_pose_cov, np.float64)))
         for i, life in enumerate(lives)
         if rows[i, 0] >= 0
     ]
@@ -276,7 +276,7 @@ def solve(lives: Sequence[Life], classes: tuple[tuple[LandmarkName, ...], ...]) 
 
 
 def marginal_covariances(solution: JointSolution) -> tuple[Floats, Floats]:
-    """Exact marginals P_ii of every landmark (n, 2, 2) m^2 and pose (p, 3, 3), from one factor and blocks of columns."""
+    """Exact marginals P_ii of every landmark (n, 2, 2), m^2, and pose (p, 3, 3), from one factor."""
     factor = _Factor(solution.H)
     n, p = len(solution.classes), len(solution.poses)
     size = 2 * n + 3 * p

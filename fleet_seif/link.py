@@ -104,9 +104,13 @@ class FaultyBus:
     def watch(self, key: str, handler: Callable[[str, bool], None]) -> None:
         self._bus.watch(key, handler)
 
-    def close(self) -> None:
+    def stop(self) -> None:
+        """Drop what is under way and stop delivering; the bus below stays open."""
         with self._wake:
             self._open = False
             self._wake.notify()
         self._thread.join()
+
+    def close(self) -> None:
+        self.stop()
         self._bus.close()

@@ -38,7 +38,6 @@ def motion_update_into(H: Floats, b: Floats, mu: Floats, model: int, u: Floats, 
     F is the Jacobian of the motion on the pose and the identity elsewhere, U = J_u cov J_u'. U is never inverted. The
     residual term keeps b right where the mean has not converged.
     """
-    n = H.shape[0]
     r = b - H @ mu
     new_x, J_new_x, J_new_u = move(model, mu[:3].copy(), u)
     U = J_new_u @ cov @ J_new_u.T
@@ -107,7 +106,7 @@ def squared_innovation(L: Floats, known: int, mu: Floats, model: int, z: Floats,
         S[1, 1] += V[1, i] * V[1, i]
     S[0, 1] = S[1, 0]
     S_inv = inverse_2x2(S)
-    return r[0] * r[0] * S_inv[0, 0] + 2.0 * r[0] * r[1] * S_inv[0, 1] + r[1] * r[1] * S_inv[1, 1]
+    return float(r[0] * r[0] * S_inv[0, 0] + 2.0 * r[0] * r[1] * S_inv[0, 1] + r[1] * r[1] * S_inv[1, 1])
 
 
 @kernel

@@ -43,7 +43,7 @@ class SeifArrays(NamedTuple):
     mu_x (3,), b_x (3,), H_xx (3, 3); active (A,) ascending; H_xa (A, 3, 2).
     mu_y (N, 2), b_y (N, 2), H_yy (N, 2, 2); degree (N,); neighbour (N, K); link (N, K) into H_link.
     H_link (E, 2, 2): rows of the lower landmark, columns of the higher.
-    q_*: the same quantities as last published, in quanta. refusals (N,): in a row. local (N,): scratch, -1 between steps.
+    q_*: the same quantities as last published, in quanta. refusals (N,): in a row. local (N,): scratch, -1.
     """
 
     counts: Ints

@@ -38,7 +38,7 @@ def _decode(data: Bytes, out: Ints) -> int:
     """Number of values, or -1 where the bytes are not of the unique form."""
     n = at = 0
     while at < len(data):
-        u, shift = 0, 0
+        u, shift = np.int64(0), 0
         while True:
             if at == len(data) or shift >= 7 * BYTES_MAX:
                 return -1

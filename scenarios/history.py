@@ -35,7 +35,7 @@ def message_time_s(data: bytes) -> float:
 
 
 def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
-    """The joint map at ascending times: the cut of all messages that are not later. Times before the first are left out."""
+    """The joint map at ascending times: the cut of all messages up to then. Times without a map are left out."""
     again = Ledger(ledger.fleet, 1)
     waiting = sorted(
         ((message_time_s(data), i, data) for stream in ledger.placed() for i, data in enumerate(stream.log)),

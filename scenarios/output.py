@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -45,10 +45,14 @@ def write_readings(folder: Path, log: Log) -> None:
     )
 
 
+def _save(path: Path, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
+    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]  # the stub confuses names with allow_pickle
+
+
 def write_truth(folder: Path, recording: Recording) -> None:
     """truth.npz: landmarks, and each vehicle's true poses (NaN where unknown)."""
     poses = {f"pose_{name}": log.truth_pose for name, log in recording.logs.items()}
-    np.savez_compressed(folder / "truth.npz", landmarks=recording.landmarks, **poses)
+    _save(folder / "truth.npz", {"landmarks": recording.landmarks, **poses})
 
 
 def write_trajectory(path: Path, time_s: Floats, poses: Floats) -> None:
@@ -122,12 +126,21 @@ def read_ledger(path: Path, fleet: str) -> Ledger:
 
 def write_drive(path: Path, result: DriveResult) -> None:
     """What a vehicle process hands to the launcher."""
-    np.savez(path, **{name: np.asarray(value) for name, value in vars(result).items()})
+    _save(path, {name: np.asarray(value) for name, value in vars(result).items()})
 
 
 def read_drive(path: Path) -> DriveResult:
     """The same, read back."""
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files}
-    counts = ("bytes_put", "messages", "readings_refused", "sightings_refused")
-    return DriveResult(**{name: int(value) if name in counts else value for name, value in arrays.items()})
+    return DriveResult(
+        pose=arrays["pose"],
+        landmarks=arrays["landmarks"],
+        signatures=arrays["signatures"],
+        filter_s=arrays["filter_s"],
+        publish_s=arrays["publish_s"],
+        bytes_put=int(arrays["bytes_put"]),
+        messages=int(arrays["messages"]),
+        readings_refused=int(arrays["readings_refused"]),
+        sightings_refused=int(arrays["sightings_refused"]),
+    )

@@ -23,7 +23,8 @@ def align(points: Floats, truth: Floats) -> Floats:
     p, q = points - points.mean(axis=0), truth - truth.mean(axis=0)
     U, _, V = np.linalg.svd(p.T @ q)
     D = np.diag([1.0, np.sign(np.linalg.det(U @ V))])
-    return p @ U @ D @ V + truth.mean(axis=0)
+    moved: Floats = p @ U @ D @ V + truth.mean(axis=0)
+    return moved
 
 
 def signature_truth(log: Log) -> dict[int, int]:

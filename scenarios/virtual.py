@@ -4,6 +4,7 @@ Vehicles, the fusion node and the link model are driven by one queue of events i
 same seed gives the same run.
 """
 
+import contextlib
 import heapq
 import itertools
 import time
@@ -132,10 +133,8 @@ class _VirtualVehicle:
 
     def _take(self, reading: Reading) -> None:
         begin = time.perf_counter()
-        try:
+        with contextlib.suppress(ReadingRefused, NumericalError):  # counted by the core
             self.core.step(reading)
-        except (ReadingRefused, NumericalError):
-            pass  # counted by the core
         middle = time.perf_counter()
         self._publish()
         self._notes.pose.append(self.core.pose)

@@ -1,0 +1,51 @@
+"""Compiles or loads every kernel before a process says that it is ready."""
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from fleet_seif.config import FilterSettings
+from fleet_seif.information import FrameTotal, to_information
+from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello
+from fleet_seif.records import Reading, Sightings
+from fleet_seif.seif import Seif
+from fleet_seif.wire import decode_message, encode_message
+
+PATIENCE_S = 2.0
+
+
+def warm_up(say: Callable[[str], None] = lambda text: None) -> float:
+    """Run everything that is compiled once, on a toy. Returns the seconds it took.
+
+    say: told where it takes longer than PATIENCE_S, which it does on the first run after an installation.
+    """
+    begin = time.perf_counter()
+    notice = threading.Timer(
+        PATIENCE_S, say, ["compiling numerical kernels (first run after an installation, about half a minute) ..."]
+    )
+    notice.daemon = True
+    notice.start()
+    seen = Sightings(
+        z=np.array([[1.0, 0.1], [1.0, -1.0], [2.0, 1.0]]),
+        cov=np.tile(1e-4 * np.eye(2), (3, 1, 1)),
+        signature=np.arange(3),
+    )
+    motion = Reading(time_s=1.0, odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=seen)
+    seif = Seif(FilterSettings(active_max=1))
+    total = FrameTotal()
+    for delta in (seif.start(seen).delta, seif.step(motion).delta):
+        total.add(delta)
+    to_information(total.delta())
+    part = FramePart(frame=0, status=FrameStatus.OPENED, delta=total.delta())
+    hello = Hello(
+        software="", life=0, placed=True, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)),
+        sighting_information_max=1.0, sightings_max=1,
+    )  # fmt: skip
+    message = DeltaMessage(
+        fleet="f", vehicle="v", epoch=Epoch(0, 0), first=0, last=0, step=0, time_s=0.0, parts=(part,), hello=hello
+    )
+    decode_message(encode_message(message))
+    notice.cancel()
+    return time.perf_counter() - begin

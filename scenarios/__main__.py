@@ -1,0 +1,5 @@
+"""python -m scenarios: the same as the fleet-seif command."""
+
+from scenarios.cli import main
+
+main()

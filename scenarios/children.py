@@ -1,0 +1,176 @@
+"""What the launched processes do: one fusion node, or one vehicle of a scenario."""
+
+import contextlib
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleet_seif.bus import Bus, ZenohBus, open_bus
+from fleet_seif.config import FusionSettings
+from fleet_seif.link import FaultyBus, LinkSettings
+from fleet_seif.warm_up import warm_up
+from fusion.core import FusionCore
+from fusion.service import FusionService
+from scenarios import output
+from scenarios.config import Scenario
+from scenarios.source import record, vehicle_names
+from vehicles import Vehicle
+from vehicles.drive import drive
+
+log = logging.getLogger(__name__)
+PROGRESS_S = 0.2
+
+Say = Callable[[dict[str, Any]], None]
+
+
+def say_json(event: dict[str, Any]) -> None:
+    """One event a line, for the launcher."""
+    print(json.dumps(event), flush=True)  # noqa: T201
+
+
+def supervise() -> None:
+    """End this process when its standard input does: the launcher holds the other end."""
+
+    def wait_for_end() -> None:
+        sys.stdin.buffer.read()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait_for_end, name="supervised", daemon=True).start()
+
+
+def end_on_sigterm() -> None:
+    """SIGTERM leaves through the with-blocks: a Zenoh session that is not closed keeps a process alive."""
+
+    def leave(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    signal.signal(signal.SIGTERM, leave)
+
+
+@contextlib.contextmanager
+def _with_link(bus: ZenohBus, link: LinkSettings, seed: Sequence[int]) -> Iterator[Bus]:
+    """The bus itself, or the bus behind a bad link."""
+    if link.perfect:
+        yield bus
+        return
+    faulty = FaultyBus(bus, link, int(np.random.SeedSequence(seed).generate_state(1)[0]))
+    try:
+        yield faulty
+    finally:
+        faulty.stop()
+
+
+def run_fusion(
+    *,
+    fleet: str,
+    settings: FusionSettings,
+    link: LinkSettings,
+    seed: int,
+    listen: Sequence[str],
+    config: Path | None,
+    insecure: bool,
+    expected: int,
+    result: Path | None,
+    say: Say,
+) -> None:
+    """Host a router and fuse until every expected vehicle has ended (0: until told to stop)."""
+    warm_up(lambda text: say({"event": "note", "text": text}))
+    with (
+        open_bus(listen=listen, config=config, insecure=insecure) as session,
+        _with_link(session, link, [seed, 1]) as bus,
+    ):
+        core = FusionCore(fleet, "fusion", settings, expected)
+        service = FusionService(bus, core, fleet, settings)
+        say({"event": "listening", "endpoint": session.endpoints()[0]})
+
+        def tell(core: FusionCore) -> None:
+            streams = core.ledger.streams.values()
+            done, total = sum(s.ended for s in streams), max(expected, len(streams))
+            say({"event": "progress", "done": done, "total": total, "messages": sum(s.next for s in streams)})
+
+        service.run(tell)
+        if result is not None:
+            _write_fusion(result, core, service)
+        say({"event": "done", "digest": core.ledger.map_digest().hex()})
+
+
+def _write_fusion(result: Path, core: FusionCore, service: FusionService) -> None:
+    output.write_ledger(result / "ledger.bin", core.ledger)
+    facts = {
+        "digest": core.ledger.map_digest().hex(),
+        "streams": stream_facts(core),
+        "fusion": {
+            "maps_served": service.statistics.maps,
+            "map_behind_s_p99": service.behind_p99_s(),
+            "solve_s_p50": float(np.median(service.statistics.solve_s)) if service.statistics.solve_s else None,
+            "inbox_dropped": service.statistics.dropped,
+            **core.counters,
+        },
+    }
+    output.write_json(result / "fusion.json", facts)
+
+
+def stream_facts(core: FusionCore) -> dict[str, dict[str, int]]:
+    """Per vehicle what a report says of its messages."""
+    return {
+        state.name: {
+            "deltas_folded": state.cut + 1,
+            "duplicates": state.duplicates,
+            "gaps_repaired": state.gaps_repaired,
+            "parked": state.parked,
+            "messages_refused": state.refused,
+        }
+        for state in core.states(time.monotonic())
+    }
+
+
+def run_vehicle(
+    scenario: Scenario,
+    *,
+    name: str,
+    connect: Sequence[str],
+    config: Path | None,
+    insecure: bool,
+    result: Path | None,
+    say: Say,
+) -> None:
+    """One vehicle of a scenario, from its first reading to the last acknowledgement."""
+    log = record(scenario, only=name).logs[name]
+    warm_up(lambda text: say({"event": "note", "text": text}))
+    number = vehicle_names(scenario).index(name)
+    with (
+        open_bus(connect=connect, config=config, insecure=insecure) as session,
+        _with_link(session, scenario.link, [scenario.run.seed, 2, number]) as bus,
+        Vehicle(
+            name,
+            fleet=scenario.fleet.name,
+            start_pose=log.start_pose,
+            start_pose_cov=log.start_pose_cov,
+            bus=bus,
+            settings=scenario.filter,
+            publish=scenario.publish,
+        ) as vehicle,
+    ):
+        say({"event": "ready"})
+        told_s = 0.0
+
+        def tell(step: int) -> None:
+            nonlocal told_s
+            if step == log.steps or time.monotonic() >= told_s + PROGRESS_S:
+                told_s = time.monotonic()
+                say({"event": "progress", "done": step, "total": log.steps})
+
+        rate_hz = scenario.run.rate_hz
+        driven = drive(vehicle, log.sightings_at(0), float(log.time_s[0]), log.readings(), rate_hz, tell)
+        if result is not None:
+            output.write_drive(result / f"{name}.npz", driven)
+        say({"event": "done"})

@@ -1,0 +1,124 @@
+"""From a finished run to its report and the files in its folder."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleet_seif.joint import JointSolution, landmark_classes, marginal_covariances, solve
+from fleet_seif.records import Floats
+from fusion.ledger import Ledger
+from fusion.mapping import lives_of
+from scenarios import output
+from scenarios.config import Scenario
+from scenarios.figure import draw_figure, figure_times
+from scenarios.history import Moment, meetings, replay
+from scenarios.recording import Recording
+from scenarios.score import MapScore, score_map, score_vehicle
+from vehicles.drive import DriveResult
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FinishedRun:
+    """All that a run left behind. streams: per vehicle what the fusion node counted; fusion: what it measured."""
+
+    name: str
+    scenario: Scenario
+    recording: Recording
+    ledger: Ledger
+    drives: dict[str, DriveResult]
+    streams: dict[str, dict[str, int]]
+    wall_s: float
+    fusion: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Outcome:
+    """The canonical map of a run, its score and its report."""
+
+    solution: JointSolution
+    landmark_cov: Floats
+    score: MapScore
+    report: dict[str, Any]
+
+
+def evaluate(run: FinishedRun) -> Outcome:
+    """Solve canonically and score."""
+    lives = lives_of(run.ledger)
+    solution = solve(lives, landmark_classes(lives))
+    landmark_cov, _ = marginal_covariances(solution)
+    score = score_map(solution, landmark_cov, run.recording)
+    report = {
+        "format": output.FORMAT,
+        "scenario": run.name,
+        "seed": run.scenario.run.seed,
+        "steps": max(log.steps for log in run.recording.logs.values()),
+        "wall_s": run.wall_s,
+        "digest": run.ledger.map_digest().hex(),
+        **{name: value for name, value in vars(score).items() if name != "landmark_truth"},
+        "vehicles": {name: _vehicle(run, name) for name in run.recording.logs},
+        "sightings_left_out": run.recording.skipped,
+        "fusion": run.fusion,
+    }
+    return Outcome(solution=solution, landmark_cov=landmark_cov, score=score, report=report)
+
+
+def _vehicle(run: FinishedRun, name: str) -> dict[str, Any]:
+    result, log = run.drives[name], run.recording.logs[name]
+    return {
+        **score_vehicle(result, log, run.recording.landmarks),
+        "step_us_p50": _us(result.filter_s, 50),
+        "step_us_p99": _us(result.filter_s, 99),
+        "publish_us_p50": _us(result.publish_s, 50),
+        "bytes_per_step_mean": result.bytes_put / max(log.steps, 1),
+        "deltas_published": result.messages,
+        **run.streams[name],
+        "readings_refused": result.readings_refused,
+        "sightings_refused": result.sightings_refused,
+    }
+
+
+def _us(seconds: Floats, percentile: float) -> float | None:
+    return float(np.percentile(seconds, percentile) * 1e6) if len(seconds) else None
+
+
+def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
+    """Everything the README promises, into a folder made by output.prepare_folder."""
+    for name, log in run.recording.logs.items():
+        output.write_readings(folder, log)
+        output.write_trajectory(folder / "trajectory" / f"{name}.tum", log.time_s, run.drives[name].pose)
+        output.write_trajectory(folder / "trajectory" / f"{name}_truth.tum", log.time_s, log.truth_pose)
+    output.write_truth(folder, run.recording)
+    output.write_map(folder, outcome.solution, outcome.landmark_cov, outcome.score.landmark_truth)
+    output.write_ledger(folder / "process" / "ledger.bin", run.ledger)
+    times, panels = figure_times(run.scenario.figure, run.recording)
+    moments = list(replay(run.ledger, times))
+    report = {**outcome.report, "meetings": meeting_report(run, moments)}
+    output.write_json(folder / "report.json", report)
+    draw_figure(
+        folder / "figure.png",
+        title=run.scenario.description,
+        recording=run.recording,
+        moments=moments,
+        panels=panels,
+        meetings=meetings(run.recording),
+        drives=run.drives,
+        kind=run.scenario.figure,
+    )
+
+
+def meeting_report(run: FinishedRun, moments: list[Moment]) -> list[dict[str, Any]]:
+    """For each pair's first meeting, the summed uncertainty just before and just after it."""
+    found = []
+    for a, b, time_s in meetings(run.recording):
+        before = [m for m in moments if m.time_s < time_s - 1e-9]
+        after = [m for m in moments if m.time_s >= time_s - 1e-9]
+        if before and after:
+            found.append({
+                "vehicles": [a, b],
+                "time_s": time_s,
+                "uncertainty_before_m2": before[-1].uncertainty_m2,
+                "uncertainty_after_m2": after[0].uncertainty_m2,
+            })  # fmt: skip
+    return found

@@ -1,0 +1,40 @@
+"""A report as a table for the terminal."""
+
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+
+def _number(value: Any, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def report_table(report: dict[str, Any]) -> Group:
+    """Vehicles in rows, then the fused map in words."""
+    table = Table(
+        title=f"{report['scenario']}, seed {report['seed']}, {report['steps']} steps, {report['wall_s']:.1f} s"
+    )
+    heads = ("vehicle", "own map error m", "pose error m", "step us", "p99 us", "publish us", "bytes/step")
+    for head in (*heads, "published", "folded", "duplicates", "repaired"):
+        table.add_column(head, justify="left" if head == "vehicle" else "right")
+    for name, row in report["vehicles"].items():
+        table.add_row(
+            name,
+            _number(row["landmark_rmse_m"], 4),
+            _number(row["pose_rmse_m"], 4),
+            _number(row["step_us_p50"], 0),
+            _number(row["step_us_p99"], 0),
+            _number(row["publish_us_p50"], 0),
+            _number(row["bytes_per_step_mean"], 0),
+            *(str(row[key]) for key in ("deltas_published", "deltas_folded", "duplicates", "gaps_repaired")),
+        )
+    lines = [
+        f"fused map: {report['fused_landmarks']} landmarks ({report['truth_landmarks']} seen in truth), "
+        f"error {_number(report['landmark_rmse_m'], 4)} m, aligned {_number(report['landmark_rmse_aligned_m'], 4)} m, "
+        f"NEES per dof {_number(report['nees_per_dof'], 2)}",
+        f"merges {report['merges']}, wrong {report['wrong_merges']}, missed {report['missed_merges']}",
+        f"digest {report['digest'][:16]}",
+    ]
+    return Group(table, Text("\n".join(lines)))

@@ -1,0 +1,106 @@
+"""The joint map in a terminal, or as JSON lines."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from fleet_seif.client import connect
+from fleet_seif.messages import JointMap
+
+GRID_ROWS = 22
+GRID_COLUMNS = 72
+
+
+async def watch(
+    endpoint: str, fleet: str, as_json: bool, config: Path | None, insecure: bool, console: Console
+) -> None:
+    """Show every map until the run ends, or until interrupted."""
+    async with connect(endpoint, fleet=fleet, config=config, insecure=insecure) as client:
+        if as_json:
+            async for joint in client.maps():
+                print(json.dumps(as_dict(joint)), flush=True)  # noqa: T201
+            return
+        with Live(Text(f"waiting for the map of fleet {fleet} ..."), console=console) as live:
+            async for joint in client.maps():
+                live.update(picture(joint))
+
+
+def as_dict(joint: JointMap) -> dict[str, Any]:
+    """A map as JSON values."""
+    return {
+        "fleet": joint.fleet,
+        "version": joint.version,
+        "canonical": joint.canonical,
+        "final": joint.final,
+        "map_digest": joint.map_digest.hex(),
+        "ledger_digest": joint.ledger_digest.hex(),
+        "cov_version": joint.cov_version,
+        "landmarks": [
+            {
+                "mean_m": joint.landmark_mean[i].tolist(),
+                "cov_m2": joint.landmark_cov[i].tolist() if len(joint.landmark_cov) else None,
+                "signature": joint.signature[i],
+                "seen_by": ["/".join(str(part) for part in name) for name in names],
+            }
+            for i, names in enumerate(joint.names)
+        ],
+        "poses": {name: joint.pose_mean[i].tolist() for i, name in enumerate(joint.poses)},
+        "vehicles": {
+            state.name: {
+                "cut": state.cut, "behind": state.behind, "parked": state.parked, "duplicates": state.duplicates,
+                "gaps_repaired": state.gaps_repaired, "refused": state.refused, "stalled": state.stalled,
+                "ended": state.ended, "healthy": state.healthy,
+            }
+            for state in joint.vehicles
+        },
+        "counters": joint.counters,
+    }  # fmt: skip
+
+
+def picture(joint: JointMap) -> RenderableType:
+    """Map, uncertainty and the health of each vehicle."""
+    table = Table(box=None)
+    for head in ("vehicle", "folded", "behind", "parked", "duplicates", "repaired", "refused", "state"):
+        table.add_column(head, justify="left" if head in ("vehicle", "state") else "right")
+    for s in joint.vehicles:
+        state = "ended" if s.ended else "stalled" if s.stalled else "mapping"
+        state += "" if s.healthy else ", doubtful"
+        counts = (s.cut + 1, s.behind, s.parked, s.duplicates, s.gaps_repaired, s.refused)
+        table.add_row(s.name, *(str(count) for count in counts), state)
+    deviation = ""
+    if len(joint.landmark_cov):
+        largest = np.sqrt(np.linalg.eigvalsh(joint.landmark_cov)[:, -1])
+        deviation = f", standard deviation median {np.median(largest):.4f} m, worst {largest.max():.4f} m"
+    shared = sum(len({name.vehicle for name in names}) > 1 for names in joint.names)
+    head = (
+        f"fleet {joint.fleet}  map {joint.version}{' final' if joint.final else ''}  "
+        f"{len(joint.names)} landmarks ({shared} shared){deviation}"
+    )
+    return Group(Text(head), grid(joint), table)
+
+
+def grid(joint: JointMap) -> Text:
+    """The map as characters: . a landmark, o one that several vehicles saw, 1 2 3 ... the vehicles."""
+    points = np.vstack([joint.landmark_mean, joint.pose_mean[:, :2]])
+    if not len(points):
+        return Text("")
+    low, high = points.min(axis=0), points.max(axis=0)
+    scale = max((high[0] - low[0]) / (GRID_COLUMNS - 1), (high[1] - low[1]) / (GRID_ROWS - 1) / 2, 1e-9)
+    rows = min(GRID_ROWS, int((high[1] - low[1]) / scale / 2) + 1)
+    cells = [[" "] * GRID_COLUMNS for _ in range(rows)]
+
+    def put(point: np.ndarray[Any, np.dtype[np.float64]], mark: str) -> None:
+        column, row = int((point[0] - low[0]) / scale), int((high[1] - point[1]) / scale / 2)
+        cells[min(row, rows - 1)][min(column, GRID_COLUMNS - 1)] = mark
+
+    for point, names in zip(joint.landmark_mean, joint.names, strict=True):
+        put(point, "o" if len({name.vehicle for name in names}) > 1 else ".")
+    for i, pose in enumerate(joint.pose_mean):
+        put(pose[:2], str((i + 1) % 10))
+    return Text("\n".join("".join(row) for row in cells))

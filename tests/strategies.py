@@ -1,0 +1,270 @@
+"""What hypothesis draws: numbers, matrices, deltas, messages and whole streams. Real values, so that cases shrink."""
+
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from hypothesis.strategies import SearchStrategy
+
+from fleet_seif.information import QUANTA_MAX, VARIABLE_MAX, FrameDelta, block_size, row_offsets
+from fleet_seif.messages import (
+    Ack,
+    Continues,
+    DeltaMessage,
+    Epoch,
+    FramePart,
+    FrameStatus,
+    Heartbeat,
+    Hello,
+    JointMap,
+    LandmarkName,
+    RangeRequest,
+    Snapshot,
+    VehicleState,
+)
+from fleet_seif.records import Floats, Ints
+
+settled = settings(
+    deadline=None, derandomize=True, max_examples=60, suppress_health_check=[HealthCheck.too_slow]
+)
+"""No deadline (kernels compile on first use), the same cases every run."""
+
+SEQUENCES = st.integers(0, 2**53)
+SMALL = st.integers(0, 10_000)
+DIGESTS = st.binary(min_size=32, max_size=32)
+NAMES = st.text("abzABZ019_-", min_size=1, max_size=32)
+EPOCHS = st.builds(Epoch, SEQUENCES, st.integers(0, 2**64 - 1))
+FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def finite(bound: float) -> SearchStrategy[float]:
+    return st.floats(-bound, bound, allow_subnormal=False)
+
+
+def vectors(n: int, bound: float = 10.0) -> SearchStrategy[Floats]:
+    return arrays(np.float64, (n,), elements=finite(bound))
+
+
+def points() -> SearchStrategy[Floats]:
+    return vectors(2)
+
+
+def poses() -> SearchStrategy[Floats]:
+    """Poses with headings over more than a turn."""
+    return st.tuples(finite(10.0), finite(10.0), finite(7.0)).map(np.array)
+
+
+def spd(n: int, least: float = 0.1) -> SearchStrategy[Floats]:
+    """Symmetric positive definite matrices, shape (n, n), eigenvalues of at least `least`."""
+    roots = arrays(np.float64, (n, n), elements=finite(1.0))
+    return roots.map(lambda A: A @ A.T + least * np.eye(n))
+
+
+def table(*shape: int) -> SearchStrategy[Floats]:
+    return arrays(np.float64, shape, elements=FLOATS)
+
+
+@st.composite
+def deltas(draw: st.DrawFn, variable_max: int = VARIABLE_MAX, bound: int = QUANTA_MAX - 1) -> FrameDelta:
+    """A delta of a few blocks of any of the variables."""
+    names = draw(st.lists(st.integers(0, variable_max), unique=True, max_size=4))
+    variables = np.array(sorted(names), np.int64)
+    pairs = [(i, j) for i in range(len(names)) for j in range(i, len(names))]
+    chosen = sorted(draw(st.lists(st.sampled_from(pairs), unique=True))) if pairs else []
+    size = sum(block_size(int(variables[i]), int(variables[j])) for i, j in chosen)
+    value = st.one_of(st.integers(-9, 9), st.integers(-bound, bound))
+
+    def values(count: int) -> Ints:
+        return np.array(draw(st.lists(value, min_size=count, max_size=count)), np.int64)
+
+    return FrameDelta(
+        variables=variables,
+        rows=np.array([i for i, _ in chosen], np.int64),
+        cols=np.array([j for _, j in chosen], np.int64),
+        H=values(size),
+        b=values(int(row_offsets(variables)[-1])),
+    )
+
+
+@st.composite
+def parts(draw: st.DrawFn) -> FramePart:
+    status = draw(st.sampled_from(FrameStatus))
+    ends = status in (FrameStatus.ENDED, FrameStatus.CORRECTED)
+    return FramePart(
+        frame=draw(st.integers(0, VARIABLE_MAX)),
+        status=status,
+        delta=draw(deltas()),
+        end_pose=draw(table(3)) if ends else None,
+    )
+
+
+def covariances() -> SearchStrategy[Floats]:
+    return st.one_of(st.just(np.zeros((3, 3))), spd(3).map(lambda A: np.asarray((A + A.T) / 2)))
+
+
+def hellos() -> SearchStrategy[Hello]:
+    continues = st.builds(Continues, epoch=EPOCHS, last=SEQUENCES, prefix_digest=DIGESTS)
+    return st.builds(
+        Hello,
+        software=st.text(max_size=50),
+        life=st.integers(0, VARIABLE_MAX),
+        placed=st.booleans(),
+        start_pose=table(3),
+        start_pose_cov=covariances(),
+        sighting_information_max=FLOATS,
+        sightings_max=st.integers(1, 2**20),
+        continues=st.one_of(st.none(), continues),
+    )
+
+
+@st.composite
+def messages(draw: st.DrawFn, first: SearchStrategy[int] = st.one_of(st.just(0), SEQUENCES)) -> DeltaMessage:  # noqa: B008
+    number = draw(first)
+    landmark, signature = st.integers(0, VARIABLE_MAX - 1), st.integers(-1, 2**63 - 1)
+    return DeltaMessage(
+        fleet=draw(NAMES),
+        vehicle=draw(NAMES),
+        epoch=draw(EPOCHS),
+        first=number,
+        last=draw(st.integers(number, 2**53)),
+        step=draw(SEQUENCES),
+        time_s=draw(FLOATS),
+        parts=tuple(draw(st.lists(parts(), max_size=2))),
+        landmarks=tuple(draw(st.lists(st.tuples(landmark, signature), max_size=3))),
+        aliases=tuple(draw(st.lists(st.tuples(landmark, landmark, st.booleans()), max_size=2))),
+        healthy=draw(st.booleans()),
+        innovation=draw(FLOATS),
+        innovation_dof=draw(SEQUENCES),
+        refused=draw(SEQUENCES),
+        hello=draw(hellos()) if number == 0 else None,
+        end=draw(st.booleans()),
+    )
+
+
+def snapshots() -> SearchStrategy[Snapshot]:
+    return st.builds(Snapshot, message=messages(st.just(0)), prefix_digest=DIGESTS)
+
+
+def heartbeats() -> SearchStrategy[Heartbeat]:
+    return st.builds(
+        Heartbeat, vehicle=NAMES, epoch=EPOCHS, last=SEQUENCES, prefix_digest=DIGESTS, ended=st.booleans()
+    )
+
+
+def acks() -> SearchStrategy[Ack]:
+    return st.builds(Ack, node=NAMES, vehicle=NAMES, epoch=EPOCHS, last=SEQUENCES, prefix_digest=DIGESTS)
+
+
+@st.composite
+def ranges(draw: st.DrawFn) -> RangeRequest:
+    first = draw(SEQUENCES)
+    last, count = draw(st.integers(first, 2**53)), draw(st.integers(1, 4096))
+    return RangeRequest(epoch=draw(EPOCHS), first=first, last=last, count=count)
+
+
+def states() -> SearchStrategy[VehicleState]:
+    count = st.integers(-1, 2**53)
+    return st.builds(
+        VehicleState,
+        name=NAMES,
+        life=st.integers(0, VARIABLE_MAX),
+        epoch=EPOCHS,
+        cut=count,
+        behind=count,
+        parked=count,
+        duplicates=count,
+        gaps_repaired=count,
+        refused=count,
+        stalled=st.booleans(),
+        ended=st.booleans(),
+        healthy=st.booleans(),
+    )
+
+
+@st.composite
+def maps(draw: st.DrawFn) -> JointMap:
+    n, v = draw(st.integers(0, 3)), draw(st.integers(0, 2))
+    name = st.builds(LandmarkName, NAMES, st.integers(0, VARIABLE_MAX), st.integers(0, 2**31))
+    groups = st.lists(name, max_size=2).map(tuple)
+    signature = st.integers(-1, 2**63 - 1)
+    return JointMap(
+        fleet=draw(NAMES),
+        version=draw(SEQUENCES),
+        canonical=draw(st.booleans()),
+        final=draw(st.booleans()),
+        map_digest=draw(DIGESTS),
+        ledger_digest=draw(DIGESTS),
+        landmark_mean=draw(table(n, 2)),
+        landmark_cov=draw(table(draw(st.sampled_from([0, n])), 2, 2)),
+        cov_version=draw(st.integers(-1, 2**53)),
+        names=tuple(draw(st.lists(groups, min_size=n, max_size=n))),
+        signature=tuple(draw(st.lists(signature, min_size=n, max_size=n))),
+        poses=tuple(draw(st.lists(NAMES, min_size=v, max_size=v))),
+        pose_mean=draw(table(v, 3)),
+        pose_cov=draw(table(draw(st.sampled_from([0, v])), 3, 3)),
+        vehicles=tuple(draw(st.lists(states(), max_size=2))),
+        counters=draw(st.dictionaries(st.text(max_size=20), SEQUENCES, max_size=3)),
+    )
+
+
+@st.composite
+def streams(draw: st.DrawFn, fleet: str = "test", vehicle: str = "v") -> list[DeltaMessage]:
+    """A stream of several frames as a vehicle may publish it: frames open, go on, end, and are corrected later."""
+    out: list[DeltaMessage] = []
+    known, frame = 0, 0
+    hello = draw(hellos())
+    count = draw(st.integers(1, 6))
+    for k in range(count):
+        new = draw(st.integers(0, 2))
+        landmarks = tuple((known + i, draw(st.integers(-1, 5))) for i in range(new))
+        known += new
+        delta = deltas(variable_max=known, bound=2**50)
+        mine: list[FramePart] = []
+        if k == 0:
+            mine.append(FramePart(frame=0, status=FrameStatus.OPENED, delta=draw(delta)))
+        elif draw(st.booleans()):
+            mine.append(FramePart(frame=frame, status=FrameStatus.CONTINUED, delta=draw(delta)))
+        else:
+            end = draw(table(3))
+            mine.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=draw(delta), end_pose=end))
+            frame += 1
+            mine.append(FramePart(frame=frame, status=FrameStatus.OPENED, delta=draw(delta)))
+        if frame > 0 and draw(st.booleans()):
+            old, end = draw(st.integers(0, frame - 1)), draw(table(3))
+            mine.append(FramePart(frame=old, status=FrameStatus.CORRECTED, delta=draw(delta), end_pose=end))
+        out.append(
+            DeltaMessage(
+                fleet=fleet,
+                vehicle=vehicle,
+                epoch=Epoch(1, 5),
+                first=k,
+                last=k,
+                step=k,
+                time_s=float(k),
+                parts=tuple(mine),
+                landmarks=landmarks,
+                innovation=float(draw(SMALL)),
+                innovation_dof=draw(SMALL),
+                refused=draw(SMALL),
+                hello=hello if k == 0 else None,
+                end=k == count - 1 and draw(st.booleans()),
+            )
+        )
+    return out
+
+
+def msgpack_values() -> SearchStrategy[Any]:
+    """Anything that msgpack writes down."""
+    leaves = st.one_of(
+        st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), st.text(max_size=8),
+        st.binary(max_size=40),
+    )  # fmt: skip
+    return st.recursive(
+        leaves,
+        lambda inner: st.one_of(
+            st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=4), inner, max_size=2)
+        ),
+        max_leaves=12,
+    )
