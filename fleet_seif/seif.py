@@ -143,6 +143,11 @@ class Seif:
             array[tuple(slice(k) for k in old.shape)] = old
         self._s = grown
 
+    def published(self) -> FrameDelta:
+        """The sum of all deltas so far, as one."""
+        variables, rows, cols, H, b = kernels.published_total(self._s)
+        return FrameDelta(variables=variables, rows=rows, cols=cols, H=H, b=b)
+
     def information(self) -> tuple[scipy.sparse.csr_array, Floats]:
         """The filter's own H (n, n) and b (n,): pose first, then landmarks by number. For tests and inspection."""
         s, n = self._s, int(self._s.counts[kernels.LANDMARKS])

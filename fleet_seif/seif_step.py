@@ -325,6 +325,40 @@ def scatter(s: SeifArrays, ids: Ints, links: Ints, H: Floats, b: Floats, mu: Flo
 
 
 @kernel
+def published_total(s: SeifArrays) -> tuple[Ints, Ints, Ints, Ints, Ints]:
+    """All that has been published, as the arrays of one FrameDelta; its cost follows the map."""
+    n, links = s.counts[LANDMARKS], s.counts[LINKS]
+    blocks = 1 + s.counts[ACTIVE] + n + links
+    variables = np.arange(n + 1)
+    rows, cols, H = np.zeros(blocks, np.int64), np.zeros(blocks, np.int64), np.empty(6 * blocks, np.int64)
+    b = np.concatenate((s.q_b_x, s.q_b_y[:n].copy().ravel()))
+    k = h = 0
+    for r in range(3):
+        for c in range(r, 3):
+            H[h] = s.q_xx[r, c]
+            h += 1
+    for a in range(s.counts[ACTIVE]):
+        k += 1
+        cols[k] = s.active[a] + 1
+        for r in range(3):
+            H[h], H[h + 1] = s.q_xa[a, r, 0], s.q_xa[a, r, 1]
+            h += 2
+    for y in range(n):
+        k += 1
+        rows[k] = cols[k] = y + 1
+        H[h], H[h + 1], H[h + 2] = s.q_yy[y, 0, 0], s.q_yy[y, 0, 1], s.q_yy[y, 1, 1]
+        h += 3
+        for i in np.argsort(s.neighbour[y, : s.degree[y]]):
+            if s.neighbour[y, i] > y:
+                k += 1
+                rows[k], cols[k] = y + 1, s.neighbour[y, i] + 1
+                for r in range(2):
+                    H[h], H[h + 1] = s.q_link[s.link[y, i], r, 0], s.q_link[s.link[y, i], r, 1]
+                    h += 2
+    return variables, rows, cols, H[:h].copy(), b
+
+
+@kernel
 def check_reading(u: Floats, cov: Floats, z: Floats, Z: Floats) -> int:
     """OK, or which rule a reading breaks: finite numbers, positive definite covariances."""
     if not (np.all(np.isfinite(u)) and np.all(np.isfinite(cov)) and np.all(np.isfinite(z)) and np.all(np.isfinite(Z))):

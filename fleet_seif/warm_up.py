@@ -38,6 +38,7 @@ def warm_up(say: Callable[[str], None] = lambda text: None) -> float:
     for delta in (seif.start(seen).delta, seif.step(motion).delta):
         total.add(delta)
     to_information(total.delta())
+    seif.published()
     part = FramePart(frame=0, status=FrameStatus.OPENED, delta=total.delta())
     hello = Hello(
         software="", life=0, placed=True, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)),

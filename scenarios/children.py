@@ -28,6 +28,7 @@ from vehicles.drive import drive
 
 log = logging.getLogger(__name__)
 PROGRESS_S = 0.2
+SWITCH_S = 1e-4  # a step must not wait 5 ms for the threads that serve the network
 
 Say = Callable[[dict[str, Any]], None]
 
@@ -41,7 +42,8 @@ def supervise() -> None:
     """End this process when its standard input does: the launcher holds the other end."""
 
     def wait_for_end() -> None:
-        sys.stdin.buffer.read()
+        while os.read(sys.stdin.fileno(), 1):  # not sys.stdin.read: it would hold a lock at the end
+            pass
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=wait_for_end, name="supervised", daemon=True).start()
@@ -144,6 +146,7 @@ def run_vehicle(
     say: Say,
 ) -> None:
     """One vehicle of a scenario, from its first reading to the last acknowledgement."""
+    sys.setswitchinterval(SWITCH_S)
     log = record(scenario, only=name).logs[name]
     warm_up(lambda text: say({"event": "note", "text": text}))
     number = vehicle_names(scenario).index(name)

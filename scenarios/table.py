@@ -16,9 +16,20 @@ def report_table(report: dict[str, Any]) -> Group:
     table = Table(
         title=f"{report['scenario']}, seed {report['seed']}, {report['steps']} steps, {report['wall_s']:.1f} s"
     )
-    heads = ("vehicle", "own map error m", "pose error m", "step us", "p99 us", "publish us", "bytes/step")
-    for head in (*heads, "published", "folded", "duplicates", "repaired"):
-        table.add_column(head, justify="left" if head == "vehicle" else "right")
+    heads = (
+        "vehicle",
+        "map error m",
+        "pose error m",
+        "step us",
+        "p99",
+        "put us",
+        "bytes",
+        "folded",
+        "twice",
+        "repaired",
+    )
+    for head in heads:
+        table.add_column(head, no_wrap=True, justify="left" if head == "vehicle" else "right")
     for name, row in report["vehicles"].items():
         table.add_row(
             name,
@@ -28,7 +39,7 @@ def report_table(report: dict[str, Any]) -> Group:
             _number(row["step_us_p99"], 0),
             _number(row["publish_us_p50"], 0),
             _number(row["bytes_per_step_mean"], 0),
-            *(str(row[key]) for key in ("deltas_published", "deltas_folded", "duplicates", "gaps_repaired")),
+            *(str(row[key]) for key in ("deltas_folded", "duplicates", "gaps_repaired")),
         )
     lines = [
         f"fused map: {report['fused_landmarks']} landmarks ({report['truth_landmarks']} seen in truth), "

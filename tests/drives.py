@@ -31,7 +31,11 @@ class Drive:
 
 def signature_of(landmark: int) -> int:
     """Signatures are not numbers: a mix-up of both shows."""
-    return 1000 - 7 * landmark
+    return 9000 - 7 * landmark
+
+
+def landmark_of(signature: int) -> int:
+    return (9000 - signature) // 7
 
 
 def square(count: int, side_m: float, seed: int) -> Floats:

@@ -114,7 +114,8 @@ def motion_update(H: Long, b: Long, mu: Floats, model: int, u: Floats, cov: Floa
     n = len(b)
     F, G = np.eye(n), np.zeros((n, 3))
     F[:3, :3], G[:3] = motion_jacobians(model, mu[:3], u)
-    P, m = invert(H), solve(H, b)
+    P = invert(H)
+    m = P @ b
     new_mu = mu.copy()
     new_mu[:3] = moved(model, mu[:3], u)
     P = F @ P @ F.T + G @ cov @ G.T

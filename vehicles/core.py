@@ -191,7 +191,11 @@ class VehicleCore:
             request = decode_range(data)
         except WireError:
             return []
-        return self.outbox.answer(request) if request.epoch == self.identity.epoch else []
+        if request.epoch != self.identity.epoch:
+            return []
+        return self.outbox.answer(
+            request, lambda: self.outbox.snapshot(self.filter.published(), self.filter.signatures)
+        )
 
     def tick(self, now_s: float) -> bytes | None:
         """A heartbeat when one is due; now_s is monotonic."""

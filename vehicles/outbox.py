@@ -3,14 +3,26 @@
 1. Messages are put in order; at most `window` past the last acknowledgement.
 2. A message is fixed for ever once its bytes were put; before that it may be coalesced with its neighbour.
 3. Above `outbox_max` messages the unsent ones are coalesced in pairs: nothing is lost, the stream gets coarser.
-4. What has been acknowledged lives on as one summed message, the snapshot.
+4. What has been acknowledged is forgotten; a snapshot is all that the filter has published less what is still here.
 """
 
+import dataclasses
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from fleet_seif.config import PublishSettings
-from fleet_seif.messages import DeltaMessage, Epoch, Heartbeat, RangeRequest, Snapshot
+from fleet_seif.information import FrameDelta, FrameTotal
+from fleet_seif.messages import (
+    DeltaMessage,
+    Epoch,
+    FramePart,
+    FrameStatus,
+    Heartbeat,
+    Hello,
+    RangeRequest,
+    Snapshot,
+)
 from fleet_seif.streams import EMPTY_PREFIX, Coalescer, extend_prefix
 from fleet_seif.wire import body_digest, encode_message, encode_snapshot
 
@@ -29,8 +41,9 @@ class Outbox:
         self._settings = settings
         self._sent: deque[_Sent] = deque()
         self._unsent: deque[DeltaMessage] = deque()
-        self._acknowledged: Coalescer | None = None
-        self._acknowledged_prefix = EMPTY_PREFIX
+        self._hello: Hello | None = None
+        self._acknowledged: _Sent | None = None
+        self._innovation, self._innovation_dof, self._refused = 0.0, 0, 0
         self.last_acknowledged = -1
         self.last_put = -1
         self.last = -1
@@ -42,6 +55,7 @@ class Outbox:
             raise ValueError(f"outbox: message {message.first} after {self.last}")
         self.last = message.last
         self._unsent.append(message)
+        self._hello = message.hello or self._hello
         if len(self._unsent) > 1 and len(self._sent) + len(self._unsent) > self._settings.outbox_max:
             self._coalesce()
 
@@ -79,12 +93,12 @@ class Outbox:
         if match is None or match.prefix_digest != prefix_digest:
             return False
         while self._sent and self._sent[0].message.last <= last:
-            message = self._sent.popleft().message
-            if self._acknowledged is None:
-                self._acknowledged = Coalescer(message)
-            else:
-                self._acknowledged.add(message)
-        self.last_acknowledged, self._acknowledged_prefix = last, prefix_digest
+            self._acknowledged = self._sent.popleft()
+            message = self._acknowledged.message
+            self._innovation += message.innovation
+            self._innovation_dof += message.innovation_dof
+            self._refused += message.refused
+        self.last_acknowledged = last
         return True
 
     def heartbeat(self, vehicle: str, epoch: Epoch, ended: bool) -> Heartbeat:
@@ -94,12 +108,35 @@ class Outbox:
             vehicle=vehicle, epoch=epoch, last=self.last_put, prefix_digest=self.prefix_digest, ended=all_put
         )
 
-    def answer(self, request: RangeRequest) -> list[bytes]:
-        """Messages of a range; where its start is acknowledged and gone, the snapshot first."""
+    def snapshot(self, published: FrameDelta, signatures: list[int]) -> Snapshot | None:
+        """The acknowledged prefix as one message; None before the first acknowledgement.
+
+        published, signatures: all that the filter has published in frame 0 so far, and the names in it.
+        """
+        if self._acknowledged is None:
+            return None
+        total, known = FrameTotal(), len(signatures)
+        total.add(published)
+        for message in [*(sent.message for sent in self._sent), *self._unsent]:
+            known -= len(message.landmarks)
+            for part in message.parts:
+                total.subtract(part.delta)
+        parts = [FramePart(frame=0, status=FrameStatus.OPENED, delta=total.delta())]
+        newest = self._acknowledged.message
+        if newest.end:
+            parts += newest.parts
+        message = dataclasses.replace(
+            newest, first=0, hello=self._hello, parts=tuple(parts), landmarks=tuple(enumerate(signatures[:known])),
+            innovation=self._innovation, innovation_dof=self._innovation_dof, refused=self._refused,
+        )  # fmt: skip
+        return Snapshot(message=message, prefix_digest=self._acknowledged.prefix_digest)
+
+    def answer(self, request: RangeRequest, snapshot: Callable[[], Snapshot | None]) -> list[bytes]:
+        """Messages of a range; where its start is acknowledged and gone, a snapshot first."""
         found = []
-        if request.first <= self.last_acknowledged and self._acknowledged is not None:
-            snapshot = Snapshot(message=self._acknowledged.message(), prefix_digest=self._acknowledged_prefix)
-            found.append(encode_snapshot(snapshot))
+        if request.first <= self.last_acknowledged:
+            taken = snapshot()
+            found += [encode_snapshot(taken)] if taken is not None else []
         for sent in self._sent:
             if len(found) >= request.count:
                 break
