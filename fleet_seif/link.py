@@ -90,8 +90,9 @@ class FaultyBus:
     def answer(self, key: str, handler: OnQuery) -> None:
         def lossy(asked: str, payload: bytes) -> list[bytes]:
             """A reply has to come within its query: it can be lost or doubled, not delayed."""
+            replies = handler(asked, payload)  # not under the lock: handlers take locks of their own
             with self._wake:
-                return [reply for reply in handler(asked, payload) for _ in self._model.arrivals(0.0)]
+                return [reply for reply in replies for _ in self._model.arrivals(0.0)]
 
         self._bus.answer(key, lossy)
 

@@ -50,7 +50,7 @@ def _decode(data: Bytes, out: Ints) -> int:
                 if byte == 0 and shift > 7:
                     return -1
                 break
-        if u >= 2 * VALUE_MAX:
+        if u >= 2 * VALUE_MAX - 1:
             return -1
         out[n] = u >> 1 if u & 1 == 0 else -(u >> 1) - 1
         n += 1

@@ -40,6 +40,7 @@ DIGEST: Final = 32
 MESSAGE_MAX: Final = 16 * 2**20
 PARTS_MAX: Final = 64
 ENTRIES_MAX: Final = 2**20
+STEP_MAX: Final = ENTRIES_MAX**2  # of a column of ENTRIES_MAX steps: their sums stay below 2^63
 SEQUENCE_MAX: Final = 2**53
 PIECE_BYTES: Final = 48_000
 PIECES_MAX: Final = 4096
@@ -185,7 +186,7 @@ def _read_delta(value: Any) -> FrameDelta:
         columns.append(numbers)
     steps, place_steps, H, b = columns
     for name, numbers in (("variables", steps), ("blocks", place_steps)):
-        if len(numbers) and (numbers[0] < 0 or np.any(numbers[1:] <= 0) or np.any(numbers > VARIABLE_MAX * 2**20)):
+        if len(numbers) and (numbers[0] < 0 or np.any(numbers[1:] <= 0) or np.any(numbers > STEP_MAX)):
             raise WireError(f"delta {name}: not ascending")
     variables, places = np.cumsum(steps), np.cumsum(place_steps)
     if len(variables) and variables[-1] > VARIABLE_MAX:

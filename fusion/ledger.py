@@ -143,6 +143,7 @@ class Ledger:
             stream.fault = f"message {message.first} names unknown or repeated landmarks or frames"
             return Receipt.REFUSED
         done: list[FramePart] = []
+        opened = {part.frame for part in message.parts} - set(stream.frames)
         try:
             for part in message.parts:
                 stream.frames.setdefault(part.frame, Frame()).total.add(part.delta)
@@ -151,6 +152,8 @@ class Ledger:
             stream.fault = f"message {message.first}: {error}"
             for part in done:
                 stream.frames[part.frame].total.subtract(part.delta)
+            for frame in opened:
+                stream.frames.pop(frame, None)
             return Receipt.REFUSED
         for part in message.parts:
             if part.end_pose is not None:
@@ -200,6 +203,8 @@ class Ledger:
         digest = hashlib.blake2b(digest_size=32)
         for vehicle, epoch in sorted(self.streams):
             stream = self.streams[vehicle, epoch]
+            if stream.next == 0:
+                continue
             digest.update(f"{vehicle} {epoch.counter} {epoch.nonce} {stream.next} ".encode() + stream.prefix_digest)
         return digest.digest()
 

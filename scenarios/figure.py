@@ -18,31 +18,36 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Affine2D
 
-from fleet_seif.records import Floats
+from fleet_seif.records import UNKNOWN_SIGNATURE, Floats
 from scenarios.history import Moment, meetings
 from scenarios.recording import Log, Recording
-from scenarios.score import rmse, signature_truth
+from scenarios.score import align, rmse, signature_truth
 
 Kind = Literal["meetings", "overview"]
 
-SIZE_IN: Final = (16.0, 9.4)
+SIZE_IN: Final = (16.0, 9.0)
 DPI: Final = 100
 EVEN_MOMENTS: Final = 60
-"""Moments spread evenly over a run; as many again, closer together, over its first tenth (half) and the meetings."""
+"""Moments spread evenly over a run; half as many again over its first tenth, where most is learned."""
 FIRST_STEP: Final = 3
 AFTER_STEPS: Final = 3
 """A meeting's second panel is so many steps after the first landmark in common, as in the paper."""
 WINDOW_STEPS: Final = 8
+"""Every step so close to a meeting is a moment."""
 MEETINGS_MAX: Final = 2
-SIGMAS: Final = 3.0
 TAIL_STEPS: Final = 40
+"""So much of the live estimate is shown in a small map, where all of it would hide the rest."""
+SIGMAS: Final = 3.0
+CROWDED_STEPS: Final = 3000
+"""Tracks of more steps in all are drawn thinner."""
 PATH_POINTS_MAX: Final = 4000
 LEGEND_VEHICLES_MAX: Final = 20
 FEW_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-INK, SHARED, GREY, FAINT = "#222222", "#111111", "#8a8a8a", "#dddddd"
-TINY, SMALL, PLAIN, LARGE = 8.5, 10.0, 11.5, 15.0
+INK, SHARED, GREY, FAINT, ALIGNED = "#222222", "#111111", "#8a8a8a", "#dddddd", "#a8780a"
+SMALL, PLAIN, LARGE = 10.0, 11.5, 15.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,14 +66,13 @@ class FigureTimes:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What all maps of a figure share. limits: x and y range, m. truths: true landmark by vehicle and signature."""
+    """What all parts of a figure share. truths: true landmark by vehicle and signature."""
 
     recording: Recording
     moments: Sequence[Moment]
     times: FigureTimes
     tracks: Mapping[str, Floats]
     colours: dict[str, Any]
-    limits: Floats
     truths: dict[str, dict[int, int]]
 
 
@@ -82,8 +86,8 @@ def figure_times(kind: Kind, recording: Recording) -> FigureTimes:
     captions = {} if kind == "overview" else {min(FIRST_STEP, last): "near the start"}
     for a, b, time_s in joins[:MEETINGS_MAX]:
         met = int(np.searchsorted(clock, time_s))
-        chosen |= set(range(max(met - WINDOW_STEPS, 0), min(met + WINDOW_STEPS, last) + 1))
         if kind == "meetings" and met > 0:
+            chosen |= set(range(max(met - WINDOW_STEPS, 0), min(met + WINDOW_STEPS, last) + 1))
             captions[met - 1] = f"just before {a} and {b} meet"
             captions[min(met + AFTER_STEPS, last)] = f"just after {a} and {b} met"
     captions[last] = "the end"
@@ -116,63 +120,70 @@ def draw_figure(
     moments: Sequence[Moment],
     tracks: Mapping[str, Floats],
 ) -> None:
-    """Write the figure as a PNG, 1600 by 940 pixels.
+    """Write the figure as a PNG of SIZE_IN by DPI pixels.
 
     Args:
         times: as `figure_times` gave them; its kind decides the layout.
         moments: the joint map at those times, as `history.replay` gave them; some or all may be missing.
         tracks: each vehicle's live estimate (T+1, 3), pose k at its log's time k; vehicles may be missing.
     """
-    scene = _Scene(
-        recording=recording,
-        moments=moments,
-        times=times,
-        tracks=tracks,
-        colours=_colours(list(recording.logs)),
-        limits=_limits(recording, moments, tracks),
-        truths={name: signature_truth(log) for name, log in recording.logs.items()},
-    )
+    truths = {name: signature_truth(log) for name, log in recording.logs.items()}
+    for of_vehicle in truths.values():
+        of_vehicle.pop(UNKNOWN_SIGNATURE, None)
+    scene = _Scene(recording, moments, times, tracks, _colours(list(recording.logs)), truths)
     figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    figure.text(0.035, 0.972, title, fontsize=LARGE, color=INK, weight="bold", va="center")
+    figure.text(0.04, 0.968, title, fontsize=LARGE, color=INK, weight="bold", va="center")
     if times.kind == "meetings":
-        grid = figure.add_gridspec(2, 3, left=0.035, right=0.68, bottom=0.085, top=0.905, wspace=0.05, hspace=0.13)
-        cells = [grid[i // 3, i % 3] for i in range(6)]
-        size = 1.0
+        _draw_panels(figure, scene)
+        _draw_curves(figure, scene, left=0.75)
     else:
-        grid = figure.add_gridspec(1, 1, left=0.035, right=0.60, bottom=0.085, top=0.935)
-        cells = [grid[0, 0]]
-        size = 1.5
-    for i, (cell, (time_s, caption)) in enumerate(zip(cells, times.panels)):
-        axes = figure.add_subplot(cell)
-        _draw_map(axes, scene, time_s, size)
-        where = f"step {_step(scene, time_s)}" if times.kind == "meetings" else f"{time_s:.4g} s"
-        axes.set_title(f"{where}: {caption}", fontsize=PLAIN, color=INK, pad=6)
-        axes.tick_params(labelbottom=i >= len(times.panels) - 3, labelleft=i % 3 == 0)
-    _draw_curves(figure, scene, 0.745 if times.kind == "meetings" else 0.675)
+        _draw_overview(figure, scene)
+        _draw_curves(figure, scene, left=0.62)
     _draw_legend(figure, scene)
     figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
 
 
-def _draw_map(axes: Axes, scene: _Scene, until_s: float, size: float) -> None:
-    """The joint map and the vehicles' tracks at one time. size: of the marks, 1 for a small map."""
-    truth = scene.recording.landmarks
+def _draw_panels(figure: Figure, scene: _Scene) -> None:
+    grid = figure.add_gridspec(2, 3, left=0.04, right=0.705, bottom=0.12, top=0.915, wspace=0.04, hspace=0.11)
+    limits = _limits(scene, 1.0)
+    for i, (time_s, caption) in enumerate(scene.times.panels):
+        axes = figure.add_subplot(grid[i // 3, i % 3])
+        _draw_map(axes, scene, time_s, limits, size=1.0)
+        axes.set_title(f"step {_step(scene, time_s)}: {caption}", fontsize=PLAIN, color=INK, pad=5)
+        axes.tick_params(labelbottom=i >= len(scene.times.panels) - 3, labelleft=i % 3 == 0)
+        axes.set_xlabel("x, m" if i >= len(scene.times.panels) - 3 else "", fontsize=SMALL, color=INK, labelpad=2)
+        axes.set_ylabel("y, m" if i % 3 == 0 else "", fontsize=SMALL, color=INK, labelpad=2)
+
+
+def _draw_overview(figure: Figure, scene: _Scene) -> None:
+    width, height = 0.53, 0.795
+    axes = figure.add_axes((0.04, 0.12, width, height))
+    ratio = width / height * SIZE_IN[0] / SIZE_IN[1]
+    _draw_map(axes, scene, scene.times.panels[-1][0], _limits(scene, ratio), size=1.5)
+    axes.set_xlabel("x, m", fontsize=SMALL, color=INK, labelpad=2)
+    axes.set_ylabel("y, m", fontsize=SMALL, color=INK, labelpad=2)
+
+
+def _draw_map(axes: Axes, scene: _Scene, until_s: float, limits: Floats, size: float) -> None:
+    """The joint map and the vehicles' tracks at one time. limits: x and y range, m. size: of the marks."""
+    truth, logs = scene.recording.landmarks, scene.recording.logs
     crowd = size * min(1.0, math.sqrt(150 / max(len(truth), 1)) + 0.15)
+    width = 1.3 if sum(log.steps for log in logs.values()) * size < CROWDED_STEPS else 0.7
     axes.set_aspect("equal")
-    axes.set_xlim(*scene.limits[0])
-    axes.set_ylim(*scene.limits[1])
-    axes.plot(truth[:, 0], truth[:, 1], "x", color=GREY, ms=4.5 * crowd, mew=0.9, zorder=2)
-    for name, log in scene.recording.logs.items():
+    axes.set_xlim(*limits[0])
+    axes.set_ylim(*limits[1])
+    axes.plot(truth[:, 0], truth[:, 1], "x", color=GREY, ms=4.5 * crowd, mew=0.9, zorder=4)
+    for name, log in logs.items():
         colour, count = scene.colours[name], int(np.searchsorted(log.time_s, until_s, side="right"))
-        _draw_path(axes, log.truth_pose[:count], color=colour, lw=0.7, alpha=0.35, zorder=1)
+        _draw_path(axes, log.truth_pose[:count], color=colour, lw=0.6 * width, alpha=0.4, zorder=1)
         track = scene.tracks.get(name, np.empty((0, 3)))[:count]
-        tail = TAIL_STEPS if scene.times.kind == "meetings" else count
-        _draw_path(axes, track[max(0, len(track) - tail) :], color=colour, lw=1.3, alpha=0.8, zorder=3)
+        tail = track[-TAIL_STEPS:] if scene.times.kind == "meetings" else track
+        _draw_path(axes, tail, color=colour, lw=width, alpha=0.75, zorder=3)
     moment = _moment_at(scene, until_s)
     if moment is not None:
         _draw_landmarks(axes, scene, moment, crowd)
         _draw_vehicles(axes, scene, moment, size)
-    axes.set_facecolor("white")
     _plain(axes)
 
 
@@ -216,58 +227,73 @@ def _draw_vehicles(axes: Axes, scene: _Scene, moment: Moment, size: float) -> No
 
 def _draw_curves(figure: Figure, scene: _Scene, left: float) -> None:
     """Summed uncertainty, and the error beside what the map claims of it."""
-    grid = figure.add_gridspec(2, 1, left=left, right=0.985, bottom=0.085, top=0.79, hspace=0.22)
+    grid = figure.add_gridspec(2, 1, left=left, right=0.985, bottom=0.12, top=0.915, hspace=0.19)
     above, below = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     steps = scene.times.kind == "meetings"
     at = [_step(scene, m.time_s) if steps else m.time_s for m in scene.moments]
     above.plot(at, [m.uncertainty_m2 for m in scene.moments], color=INK, lw=1.6)
-    above.set_title("uncertainty: all landmarks' variances summed, m²", fontsize=PLAIN, color=INK, loc="left")
+    above.set_title("variance, sum over all landmarks, m²", fontsize=PLAIN, color=INK, loc="left")
     claimed = [math.sqrt(m.uncertainty_m2 / len(m.landmark_cov)) for m in scene.moments]
-    below.plot(at, claimed, color=GREY, lw=1.4, ls=(0, (4, 2)), label="claimed (root of the mean variance)")
-    errors = [(t, error) for t, m in zip(at, scene.moments) if (error := _landmark_error(scene, m)) is not None]
-    if errors:
-        below.plot(*zip(*errors), color=INK, lw=1.6, label="true (RMS distance to the truth)")
+    below.plot(at, claimed, color=GREY, lw=1.5, ls=(0, (4, 1.5)), label="claimed (root of mean variance)")
+    errors = np.array([_landmark_errors(scene, m) for m in scene.moments]).reshape(-1, 2)
+    if np.isfinite(errors).any():
+        below.plot(at, errors[:, 0], color=INK, lw=1.6, label="true (RMS distance to truth)")
+        below.plot(at, errors[:, 1], color=ALIGNED, lw=1.3, label="true, map moved to fit best")
     below.set_title("error of a landmark, m", fontsize=PLAIN, color=INK, loc="left")
-    below.set_xlabel("step" if steps else "time, s", fontsize=PLAIN, color=INK)
+    below.set_xlabel("step" if steps else "time, s", fontsize=SMALL, color=INK, labelpad=2)
     for axes in (above, below):
         axes.set_yscale("log")
-        axes.margins(x=0.0, y=0.12)
-        axes.grid(True, which="major", color=FAINT, lw=0.7)
+        axes.margins(x=0.0, y=0.1)
+        low, high = axes.get_ylim()
+        subs = (1.0, 2.0, 5.0) if high < 2000 * low else (1.0,)
+        axes.yaxis.set_major_locator(LogLocator(subs=subs))
+        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.grid(True, color=FAINT, lw=0.7)
         _plain(axes)
-        _mark_meetings(axes, scene, named=axes is above)
-    below.legend(fontsize=SMALL, frameon=True, framealpha=0.9, edgecolor="none", loc="upper right", labelcolor=INK)
+    _mark_meetings(above, below, scene)
+    below.legend(fontsize=SMALL, framealpha=0.9, edgecolor="none", loc="best", labelcolor=INK)
 
 
-def _mark_meetings(axes: Axes, scene: _Scene, named: bool) -> None:
-    steps = scene.times.kind == "meetings"
-    for i, (a, b, time_s) in enumerate(scene.times.meetings):
-        x = _step(scene, time_s) if steps else time_s
-        axes.axvline(x, color=GREY, lw=1.0 if steps else 0.7, ls=":", zorder=1)
-        if steps and named:
-            text = f" {a} and {b} meet, step {x}"
-            axes.text(
-                x, 0.96 - 0.075 * i, text, transform=axes.get_xaxis_transform(), fontsize=SMALL, color=INK, va="top"
-            )
+def _mark_meetings(above: Axes, below: Axes, scene: _Scene) -> None:
+    """A line at each meeting; in an overview, where there may be many, at the one that joined the last vehicle."""
+    met = scene.times.meetings
+    marks: list[tuple[float, str]]
+    if scene.times.kind == "meetings":
+        marks = [(_step(scene, t), f"{a} and {b} meet, step {_step(scene, t)}") for a, b, t in met]
+    else:
+        whole = len(met) == len(scene.recording.logs) - 1
+        marks = [(t, f"all vehicles connected, {t:.3g} s") for _, _, t in met[-1:] if whole]
+    for i, (x, text) in enumerate(marks):
+        for axes in (above, below):
+            axes.axvline(x, color=GREY, lw=1.0, ls=":", zorder=1)
+        above.annotate(
+            text, (x, 0.97), xycoords=("data", "axes fraction"), xytext=(5, -15 * i), textcoords="offset points",
+            fontsize=SMALL, color=INK, va="top",
+        )  # fmt: skip
 
 
 def _draw_legend(figure: Figure, scene: _Scene) -> None:
-    left = 0.745 if scene.times.kind == "meetings" else 0.675
-
-    def line(label: str, **style: Any) -> Line2D:
-        return Line2D([], [], label=label, **style)
-
+    """One strip along the foot of the figure: first the marks, then the vehicles."""
+    tail = f", last {TAIL_STEPS} steps" if scene.times.kind == "meetings" else ""
     marks = [
-        line("true landmark", marker="x", color=GREY, ls="none", ms=6),
-        line(f"landmark, {SIGMAS:.0f}σ ellipse", marker="o", ls="none", ms=11, mfc="#eeeeee", mec=INK),
-        line("seen by one vehicle: its colour", marker="o", ls="none", ms=6, color=FEW_COLOURS[0]),
-        line("seen by several: black", marker="o", ls="none", ms=6, color=SHARED),
-        line("true track", color=GREY, lw=0.8),
-        line("live estimate", color=GREY, lw=2.0),
+        Line2D([], [], label="true landmark", marker="x", color=GREY, ls="none", ms=6),
+        Line2D([], [], label=f"estimate with {SIGMAS:.0f}σ ellipse", marker="o", ls="none", ms=10, mfc=FAINT, mec=GREY),
+        Line2D([], [], label="black: seen by several vehicles", marker="o", ls="none", ms=6, color=SHARED),
+        Line2D([], [], label="true track", color=GREY, lw=0.7),
+        Line2D([], [], label=f"live estimate{tail}", color=GREY, lw=2.0),
     ]
-    figure.legend(
-        handles=marks, loc="upper left", bbox_to_anchor=(left - 0.008, 0.95), ncols=2, fontsize=SMALL, frameon=False,
-        labelcolor=INK, borderaxespad=0.0, columnspacing=1.2, handletextpad=0.5,
-    )  # fmt: skip
+    vehicles = [
+        Line2D([], [], label=name, marker="^", color=colour, ms=8, lw=2.0, mec="white")
+        for name, colour in list(scene.colours.items())[:LEGEND_VEHICLES_MAX]
+    ]
+    few = len(vehicles) <= len(FEW_COLOURS)
+    for handles, y in ((marks + vehicles, 0.028),) if few else ((marks, 0.047), (vehicles, 0.018)):
+        figure.legend(
+            handles=handles, loc="center", bbox_to_anchor=(0.5, y), ncols=len(handles), frameon=False, labelcolor=INK,
+            fontsize=SMALL, borderaxespad=0.0, columnspacing=1.6 if few else 1.0, handletextpad=0.5,
+            handlelength=1.8,
+        )  # fmt: skip
 
 
 def _plain(axes: Axes) -> None:
@@ -293,16 +319,19 @@ def _seen_by(scene: _Scene, vehicles: set[str]) -> Any:
 
 
 def _colours(vehicles: Sequence[str]) -> dict[str, Any]:
-    """A colour for each vehicle."""
-    count = len(vehicles)
-    if count <= len(FEW_COLOURS):
+    """A colour for each vehicle; of many, neighbours in fleet order (and so often in the world) are unlike."""
+    if len(vehicles) <= len(FEW_COLOURS):
         return dict(zip(vehicles, FEW_COLOURS))
-    spread = mpl.colormaps["turbo"](np.linspace(0.04, 0.96, count))
-    return {name: tuple(colour) for name, colour in zip(vehicles, spread)}
+    golden = (math.sqrt(5) - 1) / 2
+    spread = 0.85 * mpl.colormaps["turbo"](0.03 + 0.94 * (golden * np.arange(len(vehicles)) % 1.0))
+    return {name: tuple(colour[:3]) for name, colour in zip(vehicles, spread)}
 
 
-def _landmark_error(scene: _Scene, moment: Moment) -> float | None:
-    """Root mean square distance of the landmarks from the true ones of their signature, m; None without truth."""
+def _landmark_errors(scene: _Scene, moment: Moment) -> tuple[float, float]:
+    """RMS distance of the landmarks from the true ones of their signature, m, as they are and after alignment.
+
+    NaN for what cannot be told: without truth, and for an alignment of fewer than three landmarks.
+    """
     truth = np.array(
         [
             max(scene.truths.get(name.vehicle, {}).get(signature, -1) for name in names)
@@ -311,17 +340,22 @@ def _landmark_error(scene: _Scene, moment: Moment) -> float | None:
         np.int64,
     )
     known = truth >= 0
-    return rmse(moment.solution.landmark_mean[known] - scene.recording.landmarks[truth[known]])
+    mean, target = moment.solution.landmark_mean[known], scene.recording.landmarks[truth[known]]
+    error = rmse(mean - target)
+    aligned = rmse(align(mean, target) - target) if len(mean) > 2 else None
+    return (math.nan if error is None else error, math.nan if aligned is None else aligned)
 
 
-def _limits(recording: Recording, moments: Sequence[Moment], tracks: Mapping[str, Floats]) -> Floats:
-    """A square that holds the truth, (2, 2) m; without truth, what has been estimated."""
+def _limits(scene: _Scene, ratio: float) -> Floats:
+    """x and y range, (2, 2) m, `ratio` times as wide as high, that hold the truth; without it, what was estimated."""
+    recording = scene.recording
     points = [recording.landmarks, *(log.truth_pose[:, :2] for log in recording.logs.values())]
     if not any(np.isfinite(p).all(axis=1).any() for p in points):
-        points = [m.solution.landmark_mean for m in moments[-1:]] + [track[:, :2] for track in tracks.values()]
+        points = [m.solution.landmark_mean for m in scene.moments[-1:]] + [t[:, :2] for t in scene.tracks.values()]
     found = np.concatenate([*points, np.empty((0, 2))])
     found = found[np.isfinite(found).all(axis=1)]
     low, high = (found.min(axis=0), found.max(axis=0)) if len(found) else (np.zeros(2), np.ones(2))
-    half = 0.53 * max(float(np.max(high - low)), 1e-3)
+    width, height = high - low
+    half = 0.53 * max(height, width / ratio, 1e-3) * np.array([ratio, 1.0])
     centre = (low + high) / 2
     return np.column_stack([centre - half, centre + half])

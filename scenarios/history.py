@@ -28,6 +28,13 @@ class Moment:
         return float(np.trace(self.landmark_cov, axis1=1, axis2=2).sum())
 
 
+def uncertainty_of(moment: Moment, earlier: Moment) -> float:
+    """Sum of the covariance traces of those landmarks that were in the map at an earlier moment, m^2."""
+    known = {names[0] for names in earlier.solution.classes}
+    kept = np.array([not known.isdisjoint(names) for names in moment.solution.classes])
+    return float(np.trace(moment.landmark_cov[kept], axis1=1, axis2=2).sum())
+
+
 def message_time_s(data: bytes) -> float:
     """The vehicle's time in an encoded message or snapshot."""
     message = decode_snapshot(data).message if kind_of(data) == KIND_SNAPSHOT else decode_message(data)

@@ -31,15 +31,17 @@ def progress_bars(console: Console, totals: dict[str, int], quiet: bool) -> Iter
 
 def _lines(console: Console, totals: dict[str, int]) -> Callable[[str, int, int], None]:
     steps = dict.fromkeys(totals, 0)
-    told_s = time.monotonic()
+    told_s, told = time.monotonic(), ""
 
     def update(name: str, done: int, total: int) -> None:
-        nonlocal told_s
+        nonlocal told_s, told
         if name in steps:
             steps[name] = done
         if time.monotonic() >= told_s + LINE_S:
             told_s = time.monotonic()
             text = "  ".join(f"{name} {done}/{totals[name]}" for name, done in steps.items())
-            console.print(text, highlight=False, soft_wrap=True)
+            if text != told:
+                told = text
+                console.print(text, highlight=False, soft_wrap=True)
 
     return update

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,10 +13,14 @@ from fusion.mapping import lives_of
 from scenarios import output
 from scenarios.config import Scenario
 from scenarios.figure import draw_figure, figure_times
-from scenarios.history import Moment, meetings, replay
+from scenarios.history import meetings, replay, uncertainty_of
 from scenarios.recording import Recording
 from scenarios.score import MapScore, score_map, score_vehicle
 from vehicles.drive import DriveResult
+
+
+MEETING_STEPS: Final = 3
+TIME_SLACK_S: Final = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,6 +62,7 @@ def evaluate(run: FinishedRun) -> Outcome:
         "digest": run.ledger.map_digest().hex(),
         **{name: value for name, value in vars(score).items() if name != "landmark_truth"},
         "vehicles": {name: _vehicle(run, name) for name in run.recording.logs},
+        "meetings": meeting_report(run.ledger, run.recording) if run.scenario.figure == "meetings" else [],
         "sightings_left_out": run.recording.skipped,
         "fusion": run.fusion,
     }
@@ -92,33 +97,39 @@ def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
     output.write_truth(folder, run.recording)
     output.write_map(folder, outcome.solution, outcome.landmark_cov, outcome.score.landmark_truth)
     output.write_ledger(folder / "process" / "ledger.bin", run.ledger)
-    times, panels = figure_times(run.scenario.figure, run.recording)
-    moments = list(replay(run.ledger, times))
-    report = {**outcome.report, "meetings": meeting_report(run, moments)}
-    output.write_json(folder / "report.json", report)
+    output.write_json(folder / "report.json", outcome.report)
+    times = figure_times(run.scenario.figure, run.recording)
     draw_figure(
         folder / "figure.png",
-        title=run.scenario.description,
+        title=run.scenario.description.split(":")[0],
+        times=times,
         recording=run.recording,
-        moments=moments,
-        panels=panels,
-        meetings=meetings(run.recording),
-        drives=run.drives,
-        kind=run.scenario.figure,
+        moments=list(replay(run.ledger, times.times_s)),
+        tracks={name: drive.pose for name, drive in run.drives.items()},
     )
 
 
-def meeting_report(run: FinishedRun, moments: list[Moment]) -> list[dict[str, Any]]:
-    """For each pair's first meeting, the summed uncertainty just before and just after it."""
+def meeting_report(ledger: Ledger, recording: Recording) -> list[dict[str, Any]]:
+    """For each pair of vehicles, what their first meeting did to the landmarks that were already in the map.
+
+    uncertainty_before_m2, uncertainty_after_m2: summed covariance traces of those landmarks at the step before the
+    first sighting in common and MEETING_STEPS later.
+    """
     found = []
-    for a, b, time_s in meetings(run.recording):
-        before = [m for m in moments if m.time_s < time_s - 1e-9]
-        after = [m for m in moments if m.time_s >= time_s - 1e-9]
-        if before and after:
+    for a, b, time_s in meetings(recording):
+        clock = recording.logs[a].time_s
+        at = int(np.searchsorted(clock, time_s + TIME_SLACK_S)) - 1
+        if at < 1:
+            continue
+        later = min(at + MEETING_STEPS, len(clock) - 1)
+        moments = list(replay(ledger, [clock[at - 1] + TIME_SLACK_S, clock[later] + TIME_SLACK_S]))
+        if len(moments) == 2:
+            before, after = moments
             found.append({
                 "vehicles": [a, b],
                 "time_s": time_s,
-                "uncertainty_before_m2": before[-1].uncertainty_m2,
-                "uncertainty_after_m2": after[0].uncertainty_m2,
+                "step": at,
+                "uncertainty_before_m2": before.uncertainty_m2,
+                "uncertainty_after_m2": uncertainty_of(after, before),
             })  # fmt: skip
     return found

@@ -324,3 +324,38 @@ def relative_pose(T_wa: Floats, T_wb: Floats) -> Floats:
 
 def seen_from(T_wf: Floats, y: Floats) -> Floats:
     return np.asarray(rotation(T_wf[2]).T @ (y - T_wf[:2]))
+
+
+def joint_solution(
+    frames: Sequence[tuple[Floats, Floats, Callable[[Long], Long]]],
+    priors: Sequence[tuple[int, Floats, Floats]],
+    x: Floats,
+) -> tuple[Floats, Floats]:
+    """Gauss-Newton from x until it stands still: the mean, and H linearised there.
+
+    frames: H, b and z(x) of each, z written so that complex numbers pass through it. priors: row, mean, covariance.
+    """
+    n = len(x)
+    for _ in range(100):
+        H, g = np.zeros((n, n)), np.zeros(n)
+        for H_f, b_f, z in frames:
+            J = np.array([z(x + 1e-30j * row).imag / 1e-30 for row in np.eye(n)]).T
+            H += J.T @ H_f @ J
+            g += J.T @ (b_f - H_f @ z(x.astype(complex)).real)
+        for row, mean, cov in priors:
+            at = slice(row, row + 3)
+            H[at, at] += np.linalg.inv(cov)
+            g[at] += np.linalg.solve(cov, mean - x[at])
+        step = np.linalg.solve(H, g)
+        x = x + step
+        if step @ H @ step < 1e-20:
+            return x, H
+    raise AssertionError("the reference did not converge: a case for another test")
+
+
+def frame_view(start: Long, end: Long, points: Long) -> Long:
+    """z_f: the end pose and points (m, 2) as seen from the start pose; complex numbers pass through."""
+    c, s = np.cos(start[2]), np.sin(start[2])
+    back = np.array([[c, s], [-s, c]])
+    local = (np.vstack([end[None, :2], points]) - start[:2]) @ back.T
+    return cast(Long, np.concatenate([local[0], [end[2] - start[2]], local[1:].ravel()]))

@@ -124,7 +124,9 @@ class Outbox:
         parts = [FramePart(frame=0, status=FrameStatus.OPENED, delta=total.delta())]
         newest = self._acknowledged.message
         if newest.end:
-            parts += newest.parts
+            # The last message may have been coalesced: then its own delta is in the total already.
+            end_pose = newest.parts[-1].end_pose
+            parts.append(FramePart(frame=0, status=FrameStatus.ENDED, delta=FrameDelta.nothing(), end_pose=end_pose))
         message = dataclasses.replace(
             newest, first=0, hello=self._hello, parts=tuple(parts), landmarks=tuple(enumerate(signatures[:known])),
             innovation=self._innovation, innovation_dof=self._innovation_dof, refused=self._refused,

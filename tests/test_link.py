@@ -1,0 +1,193 @@
+"""A bad link on purpose: what it may do to messages, and what it may not."""
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from fleet_seif.bus import OnPut, OnQuery
+from fleet_seif.link import FaultyBus, LinkModel, LinkSettings
+from tests.strategies import settled
+
+SECONDS = st.floats(0.0, 5.0)
+SHARES = st.floats(0.0, 1.0)
+LINKS = st.builds(
+    LinkSettings, delay_s=SECONDS, jitter_s=SECONDS, loss=SHARES, duplication=SHARES, reorder=st.booleans()
+)
+SENT = st.lists(SECONDS, max_size=30).map(sorted)
+
+
+def sent_through(settings: LinkSettings, seed: int, times: list[float]) -> list[list[float]]:
+    model = LinkModel(settings, np.random.default_rng(seed))
+    return [model.arrivals(t) for t in times]
+
+
+@given(LINKS, st.integers(0, 99), SENT)
+@settled
+def test_copies_arrive_within_delay_and_jitter(settings: LinkSettings, seed: int, times: list[float]) -> None:
+    for t, arrivals in zip(times, sent_through(settings, seed, times), strict=True):
+        assert len(arrivals) <= 2
+        for at in arrivals:
+            assert t + settings.delay_s <= at <= t + settings.delay_s + settings.jitter_s + 1e-12
+
+
+@given(LINKS, st.integers(0, 99), SENT)
+@settled
+def test_a_link_that_does_not_reorder_delivers_in_order(settings: LinkSettings, seed: int, times: list[float]) -> None:
+    ordered = settings.model_copy(update={"reorder": False})
+    arrivals = [at for each in sent_through(ordered, seed, times) for at in each]
+    assert arrivals == sorted(arrivals)
+
+
+@given(LINKS, st.integers(0, 99), SENT)
+@settled
+def test_the_same_seed_gives_the_same_faults(settings: LinkSettings, seed: int, times: list[float]) -> None:
+    assert sent_through(settings, seed, times) == sent_through(settings, seed, times)
+
+
+@given(st.integers(0, 99), SENT)
+@settled
+def test_a_perfect_link_changes_nothing(seed: int, times: list[float]) -> None:
+    assert LinkSettings().perfect
+    assert sent_through(LinkSettings(), seed, times) == [[t] for t in times]
+
+
+@given(LINKS)
+@settled
+def test_only_a_link_without_any_fault_is_perfect(settings: LinkSettings) -> None:
+    faults = (settings.delay_s, settings.jitter_s, settings.loss, settings.duplication)
+    assert settings.perfect == (faults == (0.0, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("loss", "duplication"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.4), (0.2, 0.5), (1.0, 0.5), (0.0, 1.0)])
+def test_losses_and_copies_come_as_often_as_asked(loss: float, duplication: float) -> None:
+    n = 4000
+    model = LinkModel(LinkSettings(loss=loss, duplication=duplication), np.random.default_rng(1))
+    copies = np.array([len(model.arrivals(0.0)) for _ in range(n)])
+    for count, expected in ((copies == 0, loss), (copies == 2, (1.0 - loss) * duplication)):
+        assert abs(np.mean(count) - expected) <= 5.0 * np.sqrt(expected * (1.0 - expected) / n)
+
+
+def test_jitter_alone_makes_messages_overtake() -> None:
+    model = LinkModel(LinkSettings(jitter_s=1.0), np.random.default_rng(1))
+    arrivals = [at for k in range(50) for at in model.arrivals(0.01 * k)]
+    assert arrivals != sorted(arrivals)
+
+
+@pytest.mark.parametrize("field", [{"loss": 1.1}, {"loss": -0.1}, {"delay_s": -1.0}, {"jitter_s": float("nan")}, {"drop": 0.1}])
+def test_settings_that_mean_nothing_are_refused(field: dict[str, float]) -> None:
+    with pytest.raises(ValidationError):
+        LinkSettings.model_validate(field)
+
+
+class Recorder:
+    """A bus that notes what it is asked to do."""
+
+    def __init__(self) -> None:
+        self.puts: list[tuple[str, bytes]] = []
+        self.arrived = threading.Condition()
+        self.handlers: dict[str, OnQuery] = {}
+        self.calls: list[str] = []
+
+    def put(self, key: str, payload: bytes) -> None:
+        with self.arrived:
+            self.puts.append((key, payload))
+            self.arrived.notify()
+
+    def wait_for(self, count: int) -> list[tuple[str, bytes]]:
+        with self.arrived:
+            assert self.arrived.wait_for(lambda: len(self.puts) >= count, timeout=10.0)
+            return list(self.puts)
+
+    def subscribe(self, key: str, handler: OnPut) -> None:
+        self.calls.append(f"subscribe {key}")
+
+    def answer(self, key: str, handler: OnQuery) -> None:
+        self.handlers[key] = handler
+
+    def ask(self, key: str, payload: bytes, on_reply: Callable[[bytes], None], on_done: Callable[[], None]) -> None:
+        on_reply(payload)
+        on_done()
+
+    def announce(self, key: str) -> None:
+        self.calls.append(f"announce {key}")
+
+    def watch(self, key: str, handler: Callable[[str, bool], None]) -> None:
+        self.calls.append(f"watch {key}")
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+PUTS = [(f"k{i % 3}", bytes([i])) for i in range(40)]
+
+
+def through(settings: LinkSettings, expected: int) -> list[tuple[str, bytes]]:
+    recorder = Recorder()
+    bus = FaultyBus(recorder, settings, seed=3)
+    for key, payload in PUTS:
+        bus.put(key, payload)
+    got = recorder.wait_for(expected)
+    bus.close()
+    return got
+
+
+def test_a_bus_with_a_perfect_link_delivers_every_put_in_order() -> None:
+    assert through(LinkSettings(), len(PUTS)) == PUTS
+
+
+def test_a_bus_that_only_doubles_delivers_every_put_twice() -> None:
+    assert sorted(through(LinkSettings(duplication=1.0), 2 * len(PUTS))) == sorted(PUTS * 2)
+
+
+def test_a_bus_that_delays_delivers_every_put_in_some_order() -> None:
+    got = through(LinkSettings(jitter_s=0.03), len(PUTS))
+    assert sorted(got) == sorted(PUTS)
+    assert got != PUTS
+
+
+def test_a_bus_that_loses_everything_delivers_nothing() -> None:
+    assert through(LinkSettings(loss=1.0), 0) == []
+
+
+def test_closing_drops_what_is_under_way_and_closes_the_bus_below() -> None:
+    recorder = Recorder()
+    bus = FaultyBus(recorder, LinkSettings(delay_s=60.0), seed=3)
+    bus.put("k", b"late")
+    bus.close()
+    assert recorder.puts == []
+    assert recorder.calls == ["close"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        (LinkSettings(), [b"1", b"2"]),
+        (LinkSettings(duplication=1.0), [b"1", b"1", b"2", b"2"]),
+        (LinkSettings(loss=1.0), []),
+        (LinkSettings(delay_s=60.0), [b"1", b"2"]),
+    ],
+)
+def test_answers_are_lost_and_doubled_but_never_late(settings: LinkSettings, expected: list[bytes]) -> None:
+    recorder = Recorder()
+    bus = FaultyBus(recorder, settings, seed=3)
+    bus.answer("key", lambda key, payload: [b"1", b"2"])
+    assert recorder.handlers["key"]("key", b"") == expected
+    bus.close()
+
+
+def test_what_is_not_a_message_passes_untouched() -> None:
+    recorder = Recorder()
+    bus = FaultyBus(recorder, LinkSettings(loss=1.0), seed=3)
+    heard: list[object] = []
+    bus.subscribe("s", lambda key, payload: None)
+    bus.announce("a")
+    bus.watch("w", lambda key, alive: None)
+    bus.ask("q", b"x", heard.append, lambda: heard.append("done"))
+    bus.close()
+    assert recorder.calls == ["subscribe s", "announce a", "watch w", "close"]
+    assert heard == [b"x", "done"]
