@@ -13,22 +13,9 @@ def _number(value: Any, digits: int) -> str:
 
 def report_table(report: dict[str, Any]) -> Group:
     """Vehicles in rows, then the fused map in words."""
-    table = Table(
-        title=f"{report['scenario']}, seed {report['seed']}, {report['steps']} steps, {report['wall_s']:.1f} s"
-    )
-    heads = (
-        "vehicle",
-        "map error m",
-        "pose error m",
-        "step us",
-        "p99",
-        "put us",
-        "bytes",
-        "folded",
-        "twice",
-        "repaired",
-    )
-    for head in heads:
+    title = f"{report['scenario']}, seed {report['seed']}, {report['steps']} steps, {report['wall_s']:.1f} s"
+    table = Table(title=title, box=None, padding=(0, 1))
+    for head in ("vehicle", "map m", "pose m", "step us", "p99", "put us", "bytes", "folded", "twice", "repaired"):
         table.add_column(head, no_wrap=True, justify="left" if head == "vehicle" else "right")
     for name, row in report["vehicles"].items():
         table.add_row(

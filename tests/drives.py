@@ -94,9 +94,7 @@ def sighting(z: tuple[float, float], signature: int, std: tuple[float, float] = 
 
 
 def reading(time_s: float, sightings: Sightings, u: tuple[float, float, float] = (0.1, 0.0, 0.1)) -> Reading:
-    return Reading(
-        time_s=time_s, odometry=np.array(u), odometry_cov=np.diag(ODOMETRY_STD**2), sightings=sightings
-    )
+    return Reading(time_s=time_s, odometry=np.array(u), odometry_cov=np.diag(ODOMETRY_STD**2), sightings=sightings)
 
 
 def core_of(vehicle: str, start_pose: Floats, fleet: str = FLEET, model: int = RANGE_BEARING) -> VehicleCore:

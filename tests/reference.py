@@ -4,6 +4,7 @@ Nothing here calls a kernel. Where accuracy is what a test is about, the algebra
 difference is the library's and not the reference's. Equation numbers are those of Thrun et al., IJRR 2004.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -141,7 +142,7 @@ def measurement_update(
 
 
 class DenseEif:
-    """The extended information filter over the pose and all landmarks, nothing sparse about it, exact mean each step."""
+    """The extended information filter over the pose and all landmarks: nothing sparse, an exact mean each step."""
 
     def __init__(self, model: int, start_information: float) -> None:
         self.model = model
@@ -280,9 +281,7 @@ def summed(deltas: Sequence[FrameDelta]) -> tuple[Blocks, dict[int, NDArray[np.o
     return {k: x for k, x in H.items() if np.any(x != 0)}, {k: x for k, x in b.items() if np.any(x != 0)}
 
 
-def dense(
-    H: Blocks, b: dict[int, NDArray[np.object_]], variables: Sequence[int]
-) -> tuple[Floats, Floats]:
+def dense(H: Blocks, b: dict[int, NDArray[np.object_]], variables: Sequence[int]) -> tuple[Floats, Floats]:
     """Tables as a dense symmetric matrix and a vector, in SI units."""
     at = dict(zip(variables, np.cumsum([0, *(size_of(v) for v in variables)]).tolist(), strict=False))
     n = sum(size_of(v) for v in variables)
@@ -358,4 +357,17 @@ def frame_view(start: Long, end: Long, points: Long) -> Long:
     c, s = np.cos(start[2]), np.sin(start[2])
     back = np.array([[c, s], [-s, c]])
     local = (np.vstack([end[None, :2], points]) - start[:2]) @ back.T
-    return cast(Long, np.concatenate([local[0], [end[2] - start[2]], local[1:].ravel()]))
+    return np.concatenate([local[0], [end[2] - start[2]], local[1:].ravel()])
+
+
+def same(a: Any, b: Any) -> bool:
+    """Equal in every field and type, arrays to the bit."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()
+    if type(a) is not type(b):
+        return False
+    if dataclasses.is_dataclass(a):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return bool(a == b)

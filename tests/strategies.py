@@ -26,9 +26,7 @@ from fleet_seif.messages import (
 )
 from fleet_seif.records import Floats, Ints
 
-settled = settings(
-    deadline=None, derandomize=True, max_examples=60, suppress_health_check=[HealthCheck.too_slow]
-)
+settled = settings(deadline=None, derandomize=True, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 """No deadline (kernels compile on first use), the same cases every run."""
 
 SEQUENCES = st.integers(0, 2**53)
@@ -148,9 +146,7 @@ def snapshots() -> SearchStrategy[Snapshot]:
 
 
 def heartbeats() -> SearchStrategy[Heartbeat]:
-    return st.builds(
-        Heartbeat, vehicle=NAMES, epoch=EPOCHS, last=SEQUENCES, prefix_digest=DIGESTS, ended=st.booleans()
-    )
+    return st.builds(Heartbeat, vehicle=NAMES, epoch=EPOCHS, last=SEQUENCES, prefix_digest=DIGESTS, ended=st.booleans())
 
 
 def acks() -> SearchStrategy[Ack]:
@@ -263,8 +259,6 @@ def msgpack_values() -> SearchStrategy[Any]:
     )  # fmt: skip
     return st.recursive(
         leaves,
-        lambda inner: st.one_of(
-            st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=4), inner, max_size=2)
-        ),
+        lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=4), inner, max_size=2)),
         max_leaves=12,
     )

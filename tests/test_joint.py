@@ -33,7 +33,7 @@ class Case:
 
 @st.composite
 def cases(draw: st.DrawFn, frames_max: int = 3, given: bool | None = None) -> Case:
-    """One to three lives of up to three frames; every frame's H is positive definite, its b is a little off the truth."""
+    """One to three lives of up to three frames; every H is positive definite, every b a little off the truth."""
     landmarks = np.array(draw(st.lists(points(), min_size=2, max_size=4)))
     lives, trails, shown = [], [], []
     for i in range(draw(st.integers(1, 3))):
@@ -163,11 +163,10 @@ def test_landmarks_are_the_same_if_and_only_if_their_signatures_are_known_and_eq
     assert len(certain) == len(set(certain))
 
 
-@given(cases(), st.randoms(use_true_random=False))
+@given(cases(), st.data())
 @settings(settled, max_examples=30)
-def test_the_order_of_lives_changes_neither_classes_nor_the_map(case: Case, order: "st.DataObject") -> None:
-    shuffled = list(case.lives)
-    order.shuffle(shuffled)  # type: ignore[attr-defined]
+def test_the_order_of_lives_changes_neither_classes_nor_the_map(case: Case, data: st.DataObject) -> None:
+    shuffled = data.draw(st.permutations(case.lives))
     classes = landmark_classes(case.lives)
     assert landmark_classes(shuffled) == classes
     a, b = solve(case.lives, classes), solve(shuffled, classes)
@@ -197,7 +196,12 @@ def life(
     n = 3 + 2 * count
     frame = reference.quantised(4.0 * np.eye(n) if H is None else H, np.arange(float(n)), list(range(count + 1)))
     return Life(
-        vehicle=vehicle, life=number, start_pose=np.zeros(3), start_pose_cov=GIVEN, frames=(frame,), signatures=signatures
+        vehicle=vehicle,
+        life=number,
+        start_pose=np.zeros(3),
+        start_pose_cov=GIVEN,
+        frames=(frame,),
+        signatures=signatures,
     )
 
 
@@ -225,7 +229,7 @@ def test_rows_are_named_by_what_they_hold() -> None:
     ]  # fmt: skip
 
 
-@given(st.integers(0, 4), finite(1.0))
+@given(st.integers(0, 4), finite(0.5))
 @settled
 def test_an_indefinite_system_is_refused(direction: int, tilt: float) -> None:
     H = 4.0 * np.eye(5) + tilt
@@ -284,12 +288,10 @@ def test_marginals_are_the_blocks_of_the_dense_inverse(columns: int, monkeypatch
 
 @given(cases(), st.data())
 @settings(settled, max_examples=30)
-def test_chi_square_is_normalised_by_the_dense_joint_covariance_of_landmarks(
-    case: Case, data: st.DataObject
-) -> None:
+def test_chi_square_is_normalised_by_the_dense_joint_covariance_of_landmarks(case: Case, data: st.DataObject) -> None:
     solution = solve(case.lives, landmark_classes(case.lives))
     n = 2 * len(solution.classes)
     error = data.draw(vectors(n, 1.0))
     P = np.linalg.inv(solution.H.toarray())[:n, :n]
-    expected = error @ np.linalg.solve(P, error)
+    expected = float(error @ np.linalg.solve(P, error))
     assert abs(landmark_chi_square(solution, error.reshape(-1, 2)) - expected) <= 1e-6 * max(1.0, expected)

@@ -169,7 +169,10 @@ def test_streams_of_many_frames_do_not_depend_on_order_either(
         mixed.accept(encode_message(each))
     assert mixed.map_digest() == straight.map_digest()
     assert mixed.ledger_digest() == straight.ledger_digest()
-    ends = [{f: frame.end_pose for f, frame in ledger.stream("v", Epoch(1, 5)).frames.items()} for ledger in (straight, mixed)]
+    ends = [
+        {f: frame.end_pose for f, frame in ledger.stream("v", Epoch(1, 5)).frames.items()}
+        for ledger in (straight, mixed)
+    ]
     np.testing.assert_equal(ends[0], ends[1])
 
 

@@ -63,7 +63,9 @@ def test_only_a_link_without_any_fault_is_perfect(settings: LinkSettings) -> Non
     assert settings.perfect == (faults == (0.0, 0.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(("loss", "duplication"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.4), (0.2, 0.5), (1.0, 0.5), (0.0, 1.0)])
+@pytest.mark.parametrize(
+    ("loss", "duplication"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.4), (0.2, 0.5), (1.0, 0.5), (0.0, 1.0)]
+)
 def test_losses_and_copies_come_as_often_as_asked(loss: float, duplication: float) -> None:
     n = 4000
     model = LinkModel(LinkSettings(loss=loss, duplication=duplication), np.random.default_rng(1))
@@ -78,7 +80,9 @@ def test_jitter_alone_makes_messages_overtake() -> None:
     assert arrivals != sorted(arrivals)
 
 
-@pytest.mark.parametrize("field", [{"loss": 1.1}, {"loss": -0.1}, {"delay_s": -1.0}, {"jitter_s": float("nan")}, {"drop": 0.1}])
+@pytest.mark.parametrize(
+    "field", [{"loss": 1.1}, {"loss": -0.1}, {"delay_s": -1.0}, {"jitter_s": float("nan")}, {"drop": 0.1}]
+)
 def test_settings_that_mean_nothing_are_refused(field: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
         LinkSettings.model_validate(field)

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,15 @@ from fleet_seif import joint
 from fleet_seif import seif as seif_module
 from fleet_seif.config import FilterSettings
 from fleet_seif.errors import NumericalError, ReadingRefused
-from fleet_seif.information import B_QUANTUM, H_QUANTUM, FrameDelta, FrameTotal, delta_digest, to_information
+from fleet_seif.information import (
+    B_QUANTUM,
+    H_QUANTUM,
+    FrameDelta,
+    FrameTotal,
+    delta_digest,
+    sum_deltas,
+    to_information,
+)
 from fleet_seif.models import COMPASS_XY, RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
 from fleet_seif.seif import Seif
@@ -79,9 +88,7 @@ def test_without_sparsification_it_is_the_dense_information_filter(model: int) -
 def test_in_the_linear_world_its_mean_is_batch_least_squares() -> None:
     log = drive(square(8, 4.0, 4), steps=150, seed=5, model=COMPASS_XY)
     seif, _ = run(DENSE, log, COMPASS_XY)
-    ends, landmarks, _ = reference.batch(
-        COMPASS_XY, [(np.zeros(3), DENSE.start_information, log.start, log.readings)]
-    )
+    ends, landmarks, _ = reference.batch(COMPASS_XY, [(np.zeros(3), DENSE.start_information, log.start, log.readings)])
     np.testing.assert_allclose(seif.pose, ends[0], rtol=1e-9, atol=1e-9)
     for number, signature in enumerate(seif.signatures):
         np.testing.assert_allclose(seif.landmarks[number], landmarks[signature], rtol=1e-9, atol=1e-9)
@@ -195,6 +202,15 @@ def test_a_delta_names_the_pose_and_what_was_active_or_sighted_at_any_map_size(l
     assert len(seif.landmarks) > landmarks // 2
 
 
+def test_what_it_says_it_has_published_is_the_sum_of_its_deltas() -> None:
+    log = drive(square(25, 5.0, 7), steps=100, seed=8)
+    seif, total = Seif(SPARSE), FrameTotal()
+    total.add(seif.start(log.start).delta)
+    for each in log.readings:
+        total.add(seif.step(each).delta)
+        assert delta_digest(sum_deltas([seif.published()])) == delta_digest(total.delta())
+
+
 def test_it_stays_close_to_the_truth_with_sparsification() -> None:
     log = drive(square(25, 5.0, 7), steps=400, seed=8)
     seif, _ = run(SPARSE, log)
@@ -217,13 +233,15 @@ def test_landmarks_are_numbered_in_the_order_of_their_first_sighting() -> None:
 
 def test_two_first_sightings_of_one_landmark_in_one_step_make_one_landmark() -> None:
     twice = Sightings(
-        z=np.array([[1.0, 0.1], [1.02, 0.12]]), cov=np.tile(np.diag([1e-4, 4e-4]), (2, 1, 1)), signature=np.array([5, 5])
+        z=np.array([[1.0, 0.1], [1.02, 0.12]]),
+        cov=np.tile(np.diag([1e-4, 4e-4]), (2, 1, 1)),
+        signature=np.array([5, 5]),
     )
     seif, dense = Seif(DENSE), reference.DenseEif(RANGE_BEARING, DENSE.start_information)
     seif.start(twice)
     dense.see(twice)
     assert seif.signatures == [5]
-    H, b = dense_information(seif)
+    H, _ = dense_information(seif)
     np.testing.assert_allclose(H, dense.H.astype(float), rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(mean_of(seif), dense.mu, atol=1e-12)
 
@@ -231,7 +249,7 @@ def test_two_first_sightings_of_one_landmark_in_one_step_make_one_landmark() -> 
 # Readings that are refused.
 
 
-def bent(part: str, value: object) -> Callable[[Reading], Reading]:
+def bent(part: str, value: Any) -> Callable[[Reading], Reading]:
     """A reading with one field replaced."""
 
     def bend(good: Reading) -> Reading:
@@ -264,7 +282,9 @@ def test_a_refused_reading_leaves_every_bit_of_the_filter_as_it_was(bend: Callab
     """One sighting is of a known landmark, the other of a new one, so that both paths have something to undo."""
     log = drive(square(12, 4.0, 1), steps=20, seed=2)
     seif, _ = run(SPARSE, log)
-    good = reading(9.0, Sightings(z=GOOD_Z, cov=np.tile(np.eye(2), (2, 1, 1)), signature=np.array([seif.signatures[0], 5])))
+    good = reading(
+        9.0, Sightings(z=GOOD_Z, cov=np.tile(np.eye(2), (2, 1, 1)), signature=np.array([seif.signatures[0], 5]))
+    )
     before = state_of(seif)
     with pytest.raises(ReadingRefused):
         seif.step(bend(good))

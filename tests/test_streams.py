@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import itertools
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def coalesced(messages: list[DeltaMessage]) -> DeltaMessage:
 def cut(messages: list[DeltaMessage], cuts: set[int]) -> list[DeltaMessage]:
     """The messages coalesced between cuts."""
     edges = [0, *sorted(c for c in cuts if c < len(messages)), len(messages)]
-    return [coalesced(messages[a:b]) for a, b in zip(edges, edges[1:], strict=False)]
+    return [coalesced(messages[a:b]) for a, b in itertools.pairwise(edges)]
 
 
 def folded(messages: list[DeltaMessage]) -> tuple[Ledger, Stream]:
