@@ -36,7 +36,26 @@ SupervisedOption = Annotated[bool, typer.Option("--supervised", hidden=True)]
 ResultOption = Annotated[Path | None, typer.Option(hidden=True)]
 
 
+@contextlib.contextmanager
+def _clear_errors() -> Iterator[None]:
+    """Turn what can go wrong into one clear message and an exit code."""
+    try:
+        yield
+    except ScenarioError as error:
+        _fail(str(error), 2)
+    except (RunError, NumericalError) as error:
+        _fail(str(error), 1)
+    except KeyboardInterrupt:
+        _fail("interrupted: all processes have been ended", 130)
+
+
+def _fail(text: str, code: int) -> None:
+    errors.print(f"fleet-seif: {text}", highlight=False, markup=False, soft_wrap=True)
+    raise SystemExit(code)
+
+
 @app.command()
+@_clear_errors()
 def scenarios() -> None:
     """List the scenarios that come with the package."""
     for name, description in shipped().items():
@@ -44,6 +63,7 @@ def scenarios() -> None:
 
 
 @app.command()
+@_clear_errors()
 def run(
     scenario: ScenarioArgument,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep report, map, readings and figure here.")] = None,
@@ -95,6 +115,7 @@ def _run_virtual(name: str, scenario: Scenario, progress: Callable[[str, int, in
 
 
 @app.command()
+@_clear_errors()
 def fusion(
     listen: Annotated[list[str] | None, typer.Option(help="Where to listen, e.g. tcp/127.0.0.1:7447.")] = None,
     fleet: Annotated[str | None, typer.Option(help="Name of the fleet; the scenario's by default.")] = None,
@@ -124,6 +145,7 @@ def fusion(
 
 
 @app.command()
+@_clear_errors()
 def vehicle(
     scenario: ScenarioArgument,
     name: Annotated[str, typer.Option(help="Which of the scenario's vehicles.")],
@@ -150,6 +172,7 @@ def vehicle(
 
 
 @app.command("watch")
+@_clear_errors()
 def watch_map(
     endpoint: Annotated[str, typer.Argument(help="A fusion node.")] = "tcp/127.0.0.1:7447",
     fleet: Annotated[str, typer.Option(help="Name of the fleet.")] = "fleet",
@@ -185,28 +208,9 @@ def _nothing(text: str) -> None:
     pass
 
 
-@contextlib.contextmanager
-def _clear_errors() -> Iterator[None]:
-    """Turn what can go wrong into one clear message and an exit code."""
-    try:
-        yield
-    except ScenarioError as error:
-        _fail(str(error), 2)
-    except (RunError, NumericalError) as error:
-        _fail(str(error), 1)
-    except KeyboardInterrupt:
-        _fail("interrupted: all processes have been ended", 130)
-
-
-def _fail(text: str, code: int) -> None:
-    errors.print(f"fleet-seif: {text}", highlight=False, markup=False, soft_wrap=True)
-    raise SystemExit(code)
-
-
 def main() -> None:
     """Entry point of the fleet-seif command."""
     logging.basicConfig(
         level=logging.WARNING, format="%(message)s", handlers=[RichHandler(console=errors, show_path=False)]
     )
-    with _clear_errors():
-        app()
+    app()

@@ -18,7 +18,6 @@ from scenarios.recording import Recording
 from scenarios.score import MapScore, score_map, score_vehicle
 from vehicles.drive import DriveResult
 
-
 MEETING_STEPS: Final = 3
 TIME_SLACK_S: Final = 1e-9
 

@@ -56,7 +56,7 @@ def test_set_changes_a_key_and_keeps_the_rest() -> None:
 
 @pytest.mark.parametrize("override", ["fleet.vehicles", "vehicles=3", "fleet..n=3", "=3"])
 def test_a_malformed_set_option_is_refused(override: str) -> None:
-    with pytest.raises(ScenarioError, match="TABLE.KEY=VALUE"):
+    with pytest.raises(ScenarioError, match=r"TABLE\.KEY=VALUE"):
         load_scenario("fleet", (override,))
 
 

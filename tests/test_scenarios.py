@@ -1,6 +1,5 @@
 """What the shipped scenarios must reach, as whole fleets on a virtual clock."""
 
-
 import numpy as np
 import pytest
 
@@ -44,7 +43,7 @@ def test_at_least_18_of_20_seeds_reproduce_the_papers_findings(name: str) -> Non
     outcomes = {seed: outcome_of(name, seed=seed) for seed in SEEDS}
     errors = [outcome.report["landmark_rmse_m"] for outcome in outcomes.values()]
     bad = [seed for seed, outcome in outcomes.items() if not is_good(outcome)]
-    print(f"{name}: error median {np.median(errors):.4f} m, worst {max(errors):.4f} m, seeds not good {bad}")  # noqa: T201
+    print(f"{name}: error median {np.median(errors):.4f} m, worst {max(errors):.4f} m, seeds not good {bad}")
     assert len(bad) <= 2
 
 
@@ -91,7 +90,9 @@ def test_a_small_window_and_a_small_outbox_do_not_change_the_map() -> None:
 def test_bytes_per_step_do_not_grow_with_the_map() -> None:
     means = []
     for landmarks in (50, 500, 5000):
-        run = run_virtual("fleet", "fleet.vehicles=1", f"world.landmarks={landmarks}", "world.steps=400", "run.rate_hz=0")
+        run = run_virtual(
+            "fleet", "fleet.vehicles=1", f"world.landmarks={landmarks}", "world.steps=400", "run.rate_hz=0"
+        )
         means.append(next(iter(run.drives.values())).bytes_put / 400)
     assert max(means) < 1.5 * min(means), means
 
@@ -112,11 +113,11 @@ def test_five_real_robots_do_not_diverge(
     folder = real_data.mrclam(number, tmp_path_factory)
     outcome = outcome_of("mrclam", f"dataset.path={folder}")
     report = outcome.report
-    print(f"MR.CLAM {number}: absolute {report['landmark_rmse_m']:.3f}, aligned {report['landmark_rmse_aligned_m']:.3f}")  # noqa: T201
+    print(
+        f"MR.CLAM {number}: absolute {report['landmark_rmse_m']:.3f}, aligned {report['landmark_rmse_aligned_m']:.3f}"
+    )
     assert report["fused_landmarks"] == 15
     assert report["wrong_merges"] == report["missed_merges"] == 0
     assert report["landmark_rmse_m"] < absolute_m
     assert report["landmark_rmse_aligned_m"] < aligned_m
     assert all(v["pose_rmse_m"] < 4.0 for v in report["vehicles"].values())
-
-

@@ -1,0 +1,248 @@
+"""The last mile: real processes, real Zenoh, the commands a user types."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.fleets import run_virtual
+
+COMMAND = [sys.executable, "-m", "scenarios"]
+FAST = ["--set", "world.steps=120"]
+PATIENCE_S = 60
+
+
+def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+
+def children_of(pid: int) -> list[int]:
+    """Processes started by another, read from the system."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if int(fields[1]) == pid and fields[0] != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+def running(pid: int) -> bool:
+    try:
+        return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_until(condition: object, what: str) -> None:
+    assert callable(condition)
+    end_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end_s, what
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that a short real run leaves."""
+    folder = tmp_path_factory.mktemp("run") / "out"
+    done = command("run", "three_air_vehicles", *FAST, "--out", str(folder))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "fused map: " in done.stdout
+    return folder
+
+
+def test_a_real_run_gives_the_digest_of_the_virtual_one(finished: Path) -> None:
+    report = json.loads((finished / "report.json").read_text())
+    assert report["digest"] == run_virtual("three_air_vehicles", FAST[1]).ledger.map_digest().hex()
+
+
+def test_a_lossy_real_run_gives_the_same_digest_too(finished: Path, tmp_path: Path) -> None:
+    settings = [*FAST, "--set", "link.jitter_s=0.3"]
+    done = command("run", "lossy_link", *settings, "--out", str(tmp_path), "--quiet")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    lossy, perfect = (json.loads((folder / "report.json").read_text()) for folder in (tmp_path, finished))
+    assert lossy["digest"] == perfect["digest"]
+    assert sum(vehicle["gaps_repaired"] for vehicle in lossy["vehicles"].values()) > 0
+
+
+def test_the_report_holds_what_the_readme_promises(finished: Path) -> None:
+    report = json.loads((finished / "report.json").read_text())
+    whole = (
+        "format scenario seed vehicles steps wall_s digest landmark_rmse_m landmark_rmse_aligned_m nees_per_dof "
+        "nees_per_landmark truth_landmarks fused_landmarks matched_landmarks merges wrong_merges missed_merges"
+    )
+    each = (
+        "landmark_rmse_m pose_rmse_m step_us_p50 step_us_p99 publish_us_p50 bytes_per_step_mean deltas_published "
+        "deltas_folded duplicates gaps_repaired"
+    )
+    assert set(whole.split()) <= set(report)
+    assert list(report["vehicles"]) == ["v1", "v2", "v3"]
+    for vehicle in report["vehicles"].values():
+        assert set(each.split()) <= set(vehicle)
+        assert vehicle["deltas_published"] == vehicle["deltas_folded"] == 122
+
+
+def test_solving_the_written_system_gives_the_written_means(finished: Path) -> None:
+    with np.load(finished / "map.npz") as file:
+        n = len(file["b"])
+        H = np.zeros((n, n))
+        for row in range(n):
+            at = slice(file["H_indptr"][row], file["H_indptr"][row + 1])
+            H[row, file["H_indices"][at]] = file["H_data"][at]
+        mean = np.linalg.solve(H, file["b"])
+        landmarks = 2 * len(file["landmark_mean"])
+        assert np.array_equal(H, H.T)
+        assert mean[:landmarks] == pytest.approx(file["landmark_mean"].ravel(), abs=1e-9)
+        assert mean[landmarks:] == pytest.approx(file["pose_mean"].ravel(), abs=1e-9)
+        assert np.linalg.inv(H)[:2, :2] == pytest.approx(file["landmark_cov"][0], rel=1e-6)
+        assert list(file["variables"][:2]) == ["landmark/0/x", "landmark/0/y"]
+        assert list(file["variables"][-3:]) == ["pose/v3/x", "pose/v3/y", "pose/v3/theta"]
+
+
+def test_the_readings_written_are_those_the_filters_were_fed(finished: Path) -> None:
+    run = run_virtual("three_air_vehicles", FAST[1])
+    for name, log in run.recording.logs.items():
+        with np.load(finished / "readings" / f"{name}.npz") as file:
+            assert np.array_equal(file["odometry"], log.odometry)
+            assert np.array_equal(file["sighting_range_m"], log.sighting_z[:, 0])
+            assert np.array_equal(file["sighting_bearing_rad"], log.sighting_z[:, 1])
+            assert file["odometry_cov"].shape == (120, 3, 3)
+
+
+def test_trajectories_are_in_tum_format(finished: Path) -> None:
+    for name in ("v1.tum", "v1_truth.tum"):
+        table = np.loadtxt(finished / "trajectory" / name)
+        assert table.shape == (121, 8)
+        assert np.sum(table[:, 4:] ** 2, axis=1) == pytest.approx(np.ones(121))
+
+
+def test_a_figure_is_drawn(finished: Path) -> None:
+    assert (finished / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_interrupting_a_run_ends_every_process() -> None:
+    run = subprocess.Popen(
+        [*COMMAND, "run", "fleet", "--set", "fleet.vehicles=2", "--set", "run.rate_hz=1"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        wait_until(lambda: len(children_of(run.pid)) == 3, "three processes")
+        children = children_of(run.pid)
+        run.send_signal(signal.SIGINT)
+        _, errors = run.communicate(timeout=PATIENCE_S)
+    finally:
+        run.kill()
+    assert run.returncode == 130
+    assert "interrupted" in errors
+    assert "Traceback" not in errors
+    assert not any(running(pid) for pid in children)
+
+
+def test_a_killed_launcher_takes_its_processes_with_it() -> None:
+    run = subprocess.Popen(
+        [*COMMAND, "run", "fleet", "--set", "fleet.vehicles=2", "--set", "run.rate_hz=1"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    wait_until(lambda: len(children_of(run.pid)) == 3, "three processes")
+    children = children_of(run.pid)
+    run.kill()
+    run.wait()
+    wait_until(lambda: not any(running(pid) for pid in children), "the end of the children")
+
+
+def test_a_vehicle_that_dies_ends_the_run_with_its_name() -> None:
+    run = subprocess.Popen(
+        [*COMMAND, "run", "fleet", "--set", "fleet.vehicles=2", "--set", "run.rate_hz=1"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        wait_until(lambda: len(children_of(run.pid)) == 3, "three processes")
+        victim = next(
+            pid for pid in children_of(run.pid) if b"v2" in (Path("/proc") / str(pid) / "cmdline").read_bytes()
+        )
+        others = [pid for pid in children_of(run.pid) if pid != victim]
+        os.kill(victim, signal.SIGKILL)
+        _, errors = run.communicate(timeout=PATIENCE_S)
+    finally:
+        run.kill()
+    assert run.returncode == 1
+    assert "process v2 ended with code -9" in errors
+    assert not any(running(pid) for pid in others)
+
+
+def test_a_subscriber_sees_the_map_grow_to_the_final_one() -> None:
+    fusion = subprocess.Popen(
+        [*COMMAND, "fusion", "--listen", "tcp/127.0.0.1:0", "--fleet", "demo", "--expected", "1", "--supervised"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert fusion.stdout is not None
+    assert fusion.stdin is not None
+    try:
+        endpoint = next(e["endpoint"] for line in fusion.stdout if (e := json.loads(line))["event"] == "listening")
+        watcher = subprocess.Popen(
+            [*COMMAND, "watch", endpoint, "--fleet", "demo", "--json"], stdout=subprocess.PIPE, text=True
+        )
+        driven = command(
+            "vehicle", "fleet", "--name", "v1", "--connect", endpoint, "--fleet", "demo", "--set", "world.steps=60",
+            "--set", "run.rate_hz=100",
+        )  # fmt: skip
+        assert driven.returncode == 0, driven.stderr
+        lines, _ = watcher.communicate(timeout=PATIENCE_S)
+        assert fusion.wait(PATIENCE_S) == 0
+    finally:
+        fusion.stdin.close()
+        fusion.stdout.close()
+        fusion.kill()
+    maps = [json.loads(line) for line in lines.splitlines()]
+    assert maps[-1]["final"]
+    assert [m["version"] for m in maps] == sorted({m["version"] for m in maps})
+    assert maps[-1]["vehicles"]["v1"]["cut"] == 61
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["run", "nowhere"], 2, ["no scenario 'nowhere'", "three_air_vehicles"]),
+        (["run", "fleet", "--set", "world.landmark=3"], 2, ["[world.landmark]", "landmarks"]),
+        (["run", "fleet", "--set", "fleet.vehicles=many"], 2, ["[fleet.vehicles]", "'many'"]),
+        (["run", "mrclam"], 2, ["dataset.path"]),
+        (["run", "mrclam", "--set", "dataset.path=/nowhere"], 2, ["/nowhere"]),
+        (["run", "fleet", "--out", "/proc/nothing"], 1, ["/proc/nothing", "--out"]),
+        (["run", "fleet", "--seed", "-1"], 2, ["--seed"]),
+        (["vehicle", "fleet", "--name", "v9"], 2, ["v9", "v1"]),
+        (["vehicle", "fleet", "--name", "v1", "--connect", "tcp/192.0.2.1:7447"], 1, ["--insecure"]),
+        (["fusion", "--listen", "tcp/0.0.0.0:0"], 1, ["--insecure"]),
+        (["fusion", "--listen", "nonsense"], 1, ["PROTOCOL/ADDRESS"]),
+        (["fly"], 2, ["fly"]),
+    ],
+)
+def test_bad_input_is_answered_in_a_sentence(arguments: list[str], code: int, words: list[str]) -> None:
+    done = command(*arguments)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in done.stderr
+
+
+def test_a_vehicle_without_a_fusion_node_says_so() -> None:
+    done = command("vehicle", "fleet", "--name", "v1", "--connect", "tcp/127.0.0.1:1")
+    assert done.returncode == 1
+    assert "cannot reach a fusion node at tcp/127.0.0.1:1" in done.stderr
+
+
+def test_the_scenarios_are_listed() -> None:
+    done = command("scenarios")
+    assert done.returncode == 0
+    for name in ("three_air_vehicles", "lossy_link", "mrclam"):
+        assert name in done.stdout
