@@ -14,11 +14,12 @@ given, then its newest pose.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints
 ITERATIONS_MAX: Final = 30
 STEP_TOLERANCE: Final = 1e-10
 COLUMNS_AT_ONCE: Final = 512
+DENSE_ROWS_MAX: Final = 5000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -276,17 +278,14 @@ def solve(lives: Sequence[Life], classes: tuple[tuple[LandmarkName, ...], ...]) 
 
 
 def marginal_covariances(solution: JointSolution) -> tuple[Floats, Floats]:
-    """Exact marginals P_ii of every landmark (n, 2, 2), m^2, and pose (p, 3, 3), from one factor."""
-    factor = _Factor(solution.H)
+    """Exact marginals P_ii of every landmark (n, 2, 2), m^2, and pose (p, 3, 3).
+
+    Up to DENSE_ROWS_MAX rows by a dense Cholesky inverse, above by blocks of columns of the sparse one.
+    """
     n, p = len(solution.classes), len(solution.poses)
-    size = 2 * n + 3 * p
     landmarks, poses = np.empty((n, 2, 2)), np.empty((p, 3, 3))
-    for low in range(0, size, COLUMNS_AT_ONCE):
-        high = min(low + COLUMNS_AT_ONCE, size)
-        columns = np.zeros((size, high - low))
-        columns[np.arange(low, high), np.arange(high - low)] = 1.0
-        P = factor.solve(columns)
-        for column in range(low, high):
+    for low, P in _inverse_columns(solution.H):
+        for column in range(low, low + P.shape[1]):
             if column < 2 * n:
                 at = column - column % 2
                 landmarks[column // 2, :, column % 2] = P[at : at + 2, column - low]
@@ -295,6 +294,23 @@ def marginal_covariances(solution: JointSolution) -> tuple[Floats, Floats]:
                 at = 2 * n + 3 * k
                 poses[k, :, axis] = P[at : at + 3, column - low]
     return (landmarks + landmarks.transpose(0, 2, 1)) / 2, (poses + poses.transpose(0, 2, 1)) / 2
+
+
+def _inverse_columns(H: scipy.sparse.csr_array) -> Iterator[tuple[int, Floats]]:
+    """Columns of H^-1: the number of the first, and the columns."""
+    size = H.shape[0]
+    if size <= DENSE_ROWS_MAX:
+        factor, fault = scipy.linalg.lapack.dpotrf(H.toarray(), lower=1)
+        lower, fault = scipy.linalg.lapack.dpotri(factor, lower=1) if fault == 0 else (factor, fault)
+        if fault:
+            raise NumericalError(f"information matrix of {size} rows is not positive definite: no covariances")
+        yield 0, np.tril(lower) + np.tril(lower, -1).T
+        return
+    sparse_factor = _Factor(H)
+    for low in range(0, size, COLUMNS_AT_ONCE):
+        columns = np.zeros((size, min(COLUMNS_AT_ONCE, size - low)))
+        columns[low + np.arange(columns.shape[1]), np.arange(columns.shape[1])] = 1.0
+        yield low, sparse_factor.solve(columns)
 
 
 def landmark_chi_square(solution: JointSolution, error: Floats, chosen: NDArray[np.bool_] | None = None) -> float:

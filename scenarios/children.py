@@ -38,15 +38,25 @@ def say_json(event: dict[str, Any]) -> None:
     print(json.dumps(event), flush=True)  # noqa: T201
 
 
-def supervise() -> None:
-    """End this process when its standard input does: the launcher holds the other end."""
+def supervise() -> Callable[[], None]:
+    """End this process when its standard input does: the launcher holds the other end.
 
-    def wait_for_end() -> None:
+    Returns a function that waits until the launcher has written something there: every process is ready.
+    """
+    go = threading.Event()
+
+    def listen() -> None:
         while os.read(sys.stdin.fileno(), 1):  # not sys.stdin.read: it would hold a lock at the end
-            pass
+            go.set()
         os.kill(os.getpid(), signal.SIGTERM)
 
-    threading.Thread(target=wait_for_end, name="supervised", daemon=True).start()
+    threading.Thread(target=listen, name="supervised", daemon=True).start()
+    return lambda: _wait(go)
+
+
+def _wait(go: threading.Event) -> None:
+    while not go.wait(0.1):  # in short waits: signals are handled in between
+        pass
 
 
 def end_on_sigterm() -> None:
@@ -144,6 +154,7 @@ def run_vehicle(
     insecure: bool,
     result: Path | None,
     say: Say,
+    wait_for_go: Callable[[], None],
 ) -> None:
     """One vehicle of a scenario, from its first reading to the last acknowledgement."""
     sys.setswitchinterval(SWITCH_S)
@@ -164,6 +175,7 @@ def run_vehicle(
         ) as vehicle,
     ):
         say({"event": "ready"})
+        wait_for_go()
         told_s = 0.0
 
         def tell(step: int) -> None:

@@ -140,7 +140,7 @@ def fusion(
         insecure=insecure,
         expected=expected,
         result=result,
-        say=_as_child(supervised),
+        say=_as_child(supervised)[0],
     )
 
 
@@ -159,6 +159,7 @@ def vehicle(
     supervised: SupervisedOption = False,
 ) -> None:
     """Run one vehicle of a scenario against a fusion node."""
+    say, wait_for_go = _as_child(supervised)
     overrides = [*(settings or ()), *([f"fleet.name='{fleet}'"] if fleet else [])]
     children.run_vehicle(
         load_scenario(scenario, tuple(overrides), seed),
@@ -167,7 +168,8 @@ def vehicle(
         config=config,
         insecure=insecure,
         result=result,
-        say=_as_child(supervised),
+        say=say,
+        wait_for_go=wait_for_go,
     )
 
 
@@ -184,11 +186,11 @@ def watch_map(
     asyncio.run(watch.watch(endpoint, fleet, as_json, config, insecure, console))
 
 
-def _as_child(supervised: bool) -> children.Say:
+def _as_child(supervised: bool) -> tuple[children.Say, Callable[[], None]]:
+    """How a process speaks, and how it waits for the others: for the launcher, or for a person."""
     children.end_on_sigterm()
     if supervised:
-        children.supervise()
-        return children.say_json
+        return children.say_json, children.supervise()
     last: dict[str, Any] = {}
 
     def tell(event: dict[str, Any]) -> None:
@@ -197,7 +199,7 @@ def _as_child(supervised: bool) -> children.Say:
             last = event
             console.print("  ".join(f"{key}={value}" for key, value in event.items()), highlight=False, soft_wrap=True)
 
-    return tell
+    return tell, lambda: None
 
 
 def _say(text: str) -> None:

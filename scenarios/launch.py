@@ -1,7 +1,7 @@
 """Runs a scenario with one process per vehicle and one for fusion, on an isolated loopback network.
 
-Children are told apart by name, speak JSON lines on standard output, and end when the launcher does: their standard
-input is a pipe that closes with it. If one fails, all end and its last words are shown.
+Children are told apart by name, speak JSON lines on standard output, begin together when all are ready, and end when
+the launcher does: their standard input is a pipe that closes with it. If one fails, all end and its last words are shown.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +81,15 @@ class Children:
                 words = "".join(self._errors[name]).strip() or "(it said nothing)"
                 raise RunError(f"process {name} ended with code {self._processes[name].returncode}:\n{words}")
 
+    def go(self, names: Iterable[str]) -> None:
+        """Tell processes that wait for it to begin."""
+        for name in names:
+            pipe = self._processes[name].stdin
+            assert pipe is not None
+            with contextlib.suppress(BrokenPipeError):  # it has just ended: `events` will say so
+                pipe.write("\n")
+                pipe.flush()
+
     def stop(self) -> None:
         """End all that still run: ask first, then insist."""
         for process in self._processes.values():
@@ -124,12 +133,17 @@ def run_processes(
         common = ["--result", str(folder / "process"), "--supervised"]
         listen = ["--listen", "tcp/127.0.0.1:0", "--expected", expected]
         children.start("fusion", ["fusion", "--scenario", *arguments, *listen, *common])
+        ready: set[str] = set()
         for child, event in children.events():
             if event["event"] == "listening":
                 say(f"watch it: fleet-seif watch {event['endpoint']} --fleet {scenario.fleet.name}")
                 for vehicle in recording.logs:
                     connect = ["--name", vehicle, "--connect", event["endpoint"]]
                     children.start(vehicle, ["vehicle", *arguments, *connect, *common])
+            elif event["event"] == "ready":
+                ready.add(child)
+                if ready == set(recording.logs):
+                    children.go(ready)
             elif event["event"] == "progress":
                 progress(child, event["done"], event["total"])
         process = folder / "process"

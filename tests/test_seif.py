@@ -14,6 +14,7 @@ import pytest
 
 from fleet_seif import joint
 from fleet_seif import seif as seif_module
+from fleet_seif import seif_step as kernels
 from fleet_seif.config import FilterSettings
 from fleet_seif.errors import NumericalError, ReadingRefused
 from fleet_seif.information import (
@@ -244,6 +245,38 @@ def test_two_first_sightings_of_one_landmark_in_one_step_make_one_landmark() -> 
     H, _ = dense_information(seif)
     np.testing.assert_allclose(H, dense.H.astype(float), rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(mean_of(seif), dense.mu, atol=1e-12)
+
+
+# The mean that is recovered.
+
+
+def test_after_a_step_the_mean_solves_the_rows_of_the_pose_and_of_what_was_active_or_sighted() -> None:
+    log = drive(square(25, 5.0, 7), steps=100, seed=8)
+    seif = Seif(FilterSettings(active_max=4, relax_others=0))
+    seif.start(log.start)
+    for each in log.readings:
+        before = set(seif.active.tolist())
+        seif.step(each)
+        touched = before | {seif.signatures.index(s) for s in each.sightings.signature.tolist()}
+        rows = [0, 1, 2, *(3 + 2 * n + axis for n in touched for axis in (0, 1))]
+        H, b = dense_information(seif)
+        assert np.max(np.abs(H @ mean_of(seif) - b)[rows]) < 1e-9 * np.max(np.abs(b))
+
+
+def test_relaxing_the_others_again_and_again_solves_for_all_landmarks_given_the_pose() -> None:
+    seif, _ = run(SPARSE, drive(square(25, 5.0, 7), steps=100, seed=8))
+    H, b = dense_information(seif)
+    pose = seif.pose
+    exact = np.linalg.solve(H[3:, 3:], b[3:] - H[3:, :3] @ pose)
+    for _ in range(20):
+        off = seif.landmarks.ravel() - exact
+        kernels.relax_others(seif._s, len(seif.landmarks))
+        closer = seif.landmarks.ravel() - exact
+        assert closer @ H[3:, 3:] @ closer <= off @ H[3:, 3:] @ off + 1e-12
+    for _ in range(3000):
+        kernels.relax_others(seif._s, len(seif.landmarks))
+    np.testing.assert_allclose(seif.landmarks.ravel(), exact, rtol=0.0, atol=1e-9)
+    assert np.array_equal(seif.pose, pose)
 
 
 # Readings that are refused.

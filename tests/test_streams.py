@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_seif.information import delta_digest
-from fleet_seif.messages import DeltaMessage, Epoch
+from fleet_seif.information import FrameDelta, delta_digest
+from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus
 from fleet_seif.streams import EMPTY_PREFIX, Coalescer, extend_prefix
 from fleet_seif.wire import decode_message, encode_message
 from fusion.ledger import Ledger, Receipt, Stream
@@ -100,6 +100,19 @@ def test_health_and_aliases_survive_coalescing(messages: list[DeltaMessage]) -> 
     whole = coalesced(marked)
     assert whole.aliases == tuple((m.first, m.first, True) for m in messages)
     assert not whole.healthy
+
+
+def test_a_frame_that_ended_and_was_corrected_in_one_message_has_ended_there() -> None:
+    first, second, third = (decode_message(data) for data in streams()["ann"][:3])
+    parts = [
+        FramePart(frame=0, status=status, delta=FrameDelta.nothing(), end_pose=np.full(3, float(status)))
+        for status in (FrameStatus.ENDED, FrameStatus.CORRECTED)
+    ]
+    later = [dataclasses.replace(m, parts=(part,)) for m, part in zip((second, third), parts, strict=True)]
+    (part,) = coalesced(later).parts
+    assert part.status is FrameStatus.ENDED
+    assert part.end_pose is parts[1].end_pose
+    assert [p.status for p in coalesced([first, *later]).parts] == [FrameStatus.OPENED, FrameStatus.ENDED]
 
 
 def test_only_the_next_message_of_the_same_epoch_is_taken() -> None:
