@@ -20,8 +20,9 @@ from fleet_seif.records import Floats, Ints, Reading, Sightings
 
 _FAULTS = {
     kernels.NOT_FINITE: "a number is not finite",
-    kernels.BAD_ODOMETRY_COV: "odometry_cov is not positive definite (give the sideways noise a floor, e.g. 1e-8 m^2)",
-    kernels.BAD_SIGHTING_COV: "the covariance of a sighting is not positive definite",
+    kernels.BAD_RANGE: "the range of a sighting is not positive",
+    kernels.BAD_ODOMETRY_COV: "odometry_cov is not symmetric and positive definite (give the sideways noise a floor, e.g. 1e-8 m^2)",
+    kernels.BAD_SIGHTING_COV: "the covariance of a sighting is not symmetric and positive definite",
 }
 
 
@@ -83,12 +84,21 @@ class Seif:
         return self._step(True, reading.odometry, reading.odometry_cov, reading.sightings)
 
     def _step(self, moves: bool, u: Floats, cov: Floats, seen: Sightings) -> StepResult:
+        # fresh copies: another layout or a read-only array would make numba compile the step once more
+        u, cov, z, Z = (np.array(array, np.float64, order="C") for array in (u, cov, seen.z, seen.cov))
+        count = len(seen.signature)
+        shapes = (u.shape, cov.shape, z.shape, Z.shape)
+        if shapes != ((3,), (3, 3), (count, 2), (count, 2, 2)):
+            raise ReadingRefused(
+                f"reading refused: odometry {shapes[0]}, its covariance {shapes[1]}, sightings z {shapes[2]}, their"
+                f" covariances {shapes[3]} for {count} signatures; expected (3,), (3, 3), (s, 2), (s, 2, 2)"
+            )
         first_new = int(self._s.counts[kernels.LANDMARKS])
         numbers, new = self._numbers(seen.signature, first_new)
         self._reserve(len(new), len(numbers))
         settings = self.settings
         code, statistics, *delta = kernels.seif_step(
-            self._s, self.model, moves, u, cov, numbers, seen.z, seen.cov,
+            self._s, self.model, moves, u, cov, numbers, z, Z,
             settings.active_max, settings.relax_others, settings.gate, settings.gate_patience,
         )  # fmt: skip
         if code in _FAULTS:

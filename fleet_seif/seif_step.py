@@ -19,7 +19,7 @@ from fleet_seif.local_updates import (
     squared_innovation,
     weakest_links,
 )
-from fleet_seif.models import place
+from fleet_seif.models import RANGE_BEARING, place
 from fleet_seif.records import Floats, Ints
 
 LANDMARKS: Final = 0
@@ -34,6 +34,7 @@ BAD_ODOMETRY_COV: Final = 2
 BAD_SIGHTING_COV: Final = 3
 NOT_POSITIVE_DEFINITE: Final = 4
 TOO_LARGE: Final = 5
+BAD_RANGE: Final = 6
 
 
 class SeifArrays(NamedTuple):
@@ -359,15 +360,18 @@ def published_total(s: SeifArrays) -> tuple[Ints, Ints, Ints, Ints, Ints]:
 
 
 @kernel
-def check_reading(u: Floats, cov: Floats, z: Floats, Z: Floats) -> int:
-    """OK, or which rule a reading breaks: finite numbers, positive definite covariances."""
+def check_reading(model: int, u: Floats, cov: Floats, z: Floats, Z: Floats) -> int:
+    """OK, or which rule a reading breaks: finite numbers, symmetric positive definite covariances, positive ranges."""
     if not (np.all(np.isfinite(u)) and np.all(np.isfinite(cov)) and np.all(np.isfinite(z)) and np.all(np.isfinite(Z))):
         return NOT_FINITE
-    if not cholesky_into(np.empty((3, 3)), cov, 3):
+    symmetric = cov[0, 1] == cov[1, 0] and cov[0, 2] == cov[2, 0] and cov[1, 2] == cov[2, 1]
+    if not symmetric or not cholesky_into(np.empty((3, 3)), cov, 3):
         return BAD_ODOMETRY_COV
     for k in range(len(z)):
-        if not cholesky_into(np.empty((2, 2)), Z[k], 2):
+        if Z[k, 0, 1] != Z[k, 1, 0] or not cholesky_into(np.empty((2, 2)), Z[k], 2):
             return BAD_SIGHTING_COV
+        if model == RANGE_BEARING and not z[k, 0] > 0.0:
+            return BAD_RANGE
     return OK
 
 
@@ -419,7 +423,7 @@ def seif_step(
     """
     none = np.empty(0, np.int64)
     statistics = np.zeros(3)
-    code = check_reading(u, cov, z, Z)
+    code = check_reading(model, u, cov, z, Z)
     if code != OK:
         return code, statistics, none, none, none, none, none
     ids = block_ids(s.active[: s.counts[ACTIVE]], sighted)

@@ -217,7 +217,9 @@ class Ledger:
             digest.update(stream.hello.start_pose.tobytes() + stream.hello.start_pose_cov.tobytes())
             digest.update(np.array(stream.signatures, "<i8").tobytes())
             for frame in sorted(stream.frames):
-                digest.update(frame.to_bytes(8, "little") + delta_digest(stream.frames[frame].total.delta()))
+                total = stream.frames[frame].total.delta()
+                if len(total.variables):
+                    digest.update(frame.to_bytes(8, "little") + delta_digest(total))
         return digest.digest()
 
 
