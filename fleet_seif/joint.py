@@ -14,14 +14,15 @@ given, then its newest pose.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar, cast
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
+import threadpoolctl
 from numpy.typing import NDArray
 
 from fleet_seif.errors import NumericalError
@@ -34,6 +35,14 @@ ITERATIONS_MAX: Final = 30
 STEP_TOLERANCE: Final = 1e-10
 COLUMNS_AT_ONCE: Final = 512
 DENSE_ROWS_MAX: Final = 5000
+
+F = TypeVar("F", bound=Callable[..., object])
+_libraries = threadpoolctl.ThreadpoolController()
+
+
+def one_thread(function: F) -> F:
+    """Run a function with single-threaded BLAS: the same bits on any number of cores, no threads waiting for others."""
+    return cast(F, _libraries.wrap(limits=1, user_api="blas")(function))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -229,6 +238,7 @@ def assemble(
     return scipy.sparse.csr_array(H), g
 
 
+@one_thread
 def solve(lives: Sequence[Life], classes: tuple[tuple[LandmarkName, ...], ...]) -> JointSolution:
     """The joint map of these lives, in canonical order (by vehicle, then life).
 
@@ -277,6 +287,7 @@ def solve(lives: Sequence[Life], classes: tuple[tuple[LandmarkName, ...], ...]) 
     )
 
 
+@one_thread
 def marginal_covariances(solution: JointSolution) -> tuple[Floats, Floats]:
     """Exact marginals P_ii of every landmark (n, 2, 2), m^2, and pose (p, 3, 3).
 

@@ -21,7 +21,8 @@ from fleet_seif.records import Floats, Ints, Reading, Sightings
 _FAULTS = {
     kernels.NOT_FINITE: "a number is not finite",
     kernels.BAD_RANGE: "the range of a sighting is not positive",
-    kernels.BAD_ODOMETRY_COV: "odometry_cov is not symmetric and positive definite (give the sideways noise a floor, e.g. 1e-8 m^2)",
+    kernels.BAD_ODOMETRY_COV: "odometry_cov is not symmetric and positive definite "
+    "(give the sideways noise a floor, e.g. 1e-8 m^2)",
     kernels.BAD_SIGHTING_COV: "the covariance of a sighting is not symmetric and positive definite",
 }
 

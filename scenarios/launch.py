@@ -1,7 +1,8 @@
 """Runs a scenario with one process per vehicle and one for fusion, on an isolated loopback network.
 
 Children are told apart by name, speak JSON lines on standard output, begin together when all are ready, and end
-when the launcher does: their standard input is a pipe that closes with it. If one fails, all end and its last words are shown.
+when the launcher does: their standard input is a pipe that closes with it. If one fails, all end and its last words
+are shown.
 """
 
 import contextlib

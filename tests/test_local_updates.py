@@ -146,6 +146,7 @@ def blocks(draw: st.DrawFn) -> Block:
     H = np.zeros((n, n))
     H[np.ix_(linked, linked)] += draw(spd(len(linked)))
     H[np.ix_(unlinked, unlinked)] += draw(spd(len(unlinked)))
+    assume(all(np.any(H[:3, 3 + 2 * i : 5 + 2 * i]) for i in (*stay, *drop)))  # active means linked to the pose
     return Block((H + H.T) / 2, draw(vectors(n, 5.0)), stay, drop, passive)
 
 
