@@ -5,6 +5,7 @@ recovers its mean given the rest of the map, and scatters what changed. Nothing 
 costs the same at any map size. On failure the arrays are as they were.
 """
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -27,6 +28,8 @@ LINKS: Final = 1
 ACTIVE: Final = 2
 CURSOR: Final = 3
 DEGREE_MAX: Final = 4
+
+ASYMMETRY_MAX: Final = 1e-9
 
 OK: Final = 0
 NOT_FINITE: Final = 1
@@ -360,15 +363,25 @@ def published_total(s: SeifArrays) -> tuple[Ints, Ints, Ints, Ints, Ints]:
 
 
 @kernel
+def is_covariance(A: Floats) -> bool:
+    """Symmetric to rounding, and positive definite."""
+    n = len(A)
+    for i in range(n):
+        for j in range(i):
+            if not abs(A[i, j] - A[j, i]) <= ASYMMETRY_MAX * math.sqrt(abs(A[i, i] * A[j, j])):
+                return False
+    return cholesky_into(np.empty((n, n)), A, n)
+
+
+@kernel
 def check_reading(model: int, u: Floats, cov: Floats, z: Floats, Z: Floats) -> int:
     """OK, or which rule a reading breaks: finite numbers, symmetric positive definite covariances, positive ranges."""
     if not (np.all(np.isfinite(u)) and np.all(np.isfinite(cov)) and np.all(np.isfinite(z)) and np.all(np.isfinite(Z))):
         return NOT_FINITE
-    symmetric = cov[0, 1] == cov[1, 0] and cov[0, 2] == cov[2, 0] and cov[1, 2] == cov[2, 1]
-    if not symmetric or not cholesky_into(np.empty((3, 3)), cov, 3):
+    if not is_covariance(cov):
         return BAD_ODOMETRY_COV
     for k in range(len(z)):
-        if Z[k, 0, 1] != Z[k, 1, 0] or not cholesky_into(np.empty((2, 2)), Z[k], 2):
+        if not is_covariance(Z[k]):
             return BAD_SIGHTING_COV
         if model == RANGE_BEARING and not z[k, 0] > 0.0:
             return BAD_RANGE

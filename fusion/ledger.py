@@ -60,7 +60,7 @@ class Stream:
     parked: dict[int, tuple[DeltaMessage, bytes]] = field(default_factory=dict)
     log: list[bytes] = field(default_factory=list)
     firsts: list[int] = field(default_factory=list)
-    time_s: float = 0.0
+    times_s: list[float] = field(default_factory=list)
     step: int = 0
     healthy: bool = True
     ended: bool = False
@@ -242,6 +242,7 @@ def _names_follow(stream: Stream, message: DeltaMessage) -> bool:
 def _take_note(stream: Stream, message: DeltaMessage, data: bytes) -> None:
     stream.log.append(data)
     stream.firsts.append(message.first)
+    stream.times_s.append(message.time_s)
     stream.next = message.last + 1
-    stream.step, stream.time_s = message.step, message.time_s
+    stream.step = message.step
     stream.healthy, stream.ended = message.healthy, message.end

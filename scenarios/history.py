@@ -8,7 +8,6 @@ import numpy as np
 from fleet_seif.errors import NumericalError
 from fleet_seif.joint import JointSolution, landmark_classes, marginal_covariances, solve
 from fleet_seif.records import Floats
-from fleet_seif.wire import KIND_SNAPSHOT, decode_message, decode_snapshot, kind_of
 from fusion.ledger import Ledger
 from fusion.mapping import lives_of
 from scenarios.recording import Log, Recording
@@ -35,17 +34,11 @@ def uncertainty_of(moment: Moment, earlier: Moment) -> float:
     return float(np.trace(moment.landmark_cov[kept], axis1=1, axis2=2).sum())
 
 
-def message_time_s(data: bytes) -> float:
-    """The vehicle's time in an encoded message or snapshot."""
-    message = decode_snapshot(data).message if kind_of(data) == KIND_SNAPSHOT else decode_message(data)
-    return message.time_s
-
-
 def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
     """The joint map at ascending times: the cut of all messages up to then. Times without a map are left out."""
     again = Ledger(ledger.fleet, 1)
     waiting = sorted(
-        ((message_time_s(data), i, data) for stream in ledger.placed() for i, data in enumerate(stream.log)),
+        ((t, i, data) for s in ledger.placed() for i, (t, data) in enumerate(zip(s.times_s, s.log, strict=True))),
         key=lambda item: item[:2],
     )
     at = 0

@@ -28,11 +28,13 @@ def report_table(report: dict[str, Any]) -> Group:
             _number(row["bytes_per_step_mean"], 0),
             *(str(row[key]) for key in ("deltas_folded", "duplicates", "gaps_repaired")),
         )
+    refused = {name: row["readings_refused"] for name, row in report["vehicles"].items() if row["readings_refused"]}
     lines = [
         f"fused map: {report['fused_landmarks']} landmarks ({report['truth_landmarks']} seen in truth), "
         f"error {_number(report['landmark_rmse_m'], 4)} m, aligned {_number(report['landmark_rmse_aligned_m'], 4)} m, "
         f"NEES per dof {_number(report['nees_per_dof'], 2)}",
         f"merges {report['merges']}, wrong {report['wrong_merges']}, missed {report['missed_merges']}",
+        *(f"{n} readings of {name} were refused: its map lacks them" for name, n in refused.items()),
         f"digest {report['digest'][:16]}",
     ]
     return Group(table, Text("\n".join(lines)))
