@@ -209,7 +209,7 @@ def test_a_snapshot_of_a_vehicle_is_what_its_acknowledged_messages_leave_behind(
         parts = snapshot.message.parts
         assert delta_digest(parts[0].delta) == delta_digest(stream.frames[0].total.delta())
         assert [s for _, s in snapshot.message.landmarks] == stream.signatures
-        assert (snapshot.message.step, snapshot.message.time_s) == (stream.step, stream.time_s)
+        assert (snapshot.message.step, snapshot.message.time_s) == (stream.step, stream.times_s[-1])
         assert snapshot.prefix_digest == stream.prefix_digest
         answer = core.on_range(encode_range(RangeRequest(epoch=core.identity.epoch, first=0, last=0, count=1)))
         assert same(decode_snapshot(answer[0]).message, snapshot.message)

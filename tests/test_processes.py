@@ -76,6 +76,15 @@ def test_a_lossy_real_run_gives_the_same_digest_too(finished: Path, tmp_path: Pa
     assert sum(vehicle["gaps_repaired"] for vehicle in lossy["vehicles"].values()) > 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 21))
+def test_whole_lossy_real_runs_give_the_digest_of_a_perfect_link_over_seeds(seed: int, tmp_path: Path) -> None:
+    done = command("run", "lossy_link", "--seed", str(seed), "--out", str(tmp_path), "--quiet")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["digest"] == run_virtual("three_air_vehicles", seed=seed).ledger.map_digest().hex()
+
+
 def test_the_report_holds_what_the_readme_promises(finished: Path) -> None:
     report = json.loads((finished / "report.json").read_text())
     whole = (

@@ -52,7 +52,7 @@ def effect(messages: list[DeltaMessage]) -> object:
     }
     assert stream.hello is not None
     return (
-        frames, stream.signatures, stream.next, stream.step, stream.time_s, stream.healthy, stream.ended,
+        frames, stream.signatures, stream.next, stream.step, stream.times_s[-1], stream.healthy, stream.ended,
         stream.hello.software, ledger.map_digest(),
     )  # fmt: skip
 
