@@ -119,7 +119,7 @@ def _write_fusion(result: Path, core: FusionCore, service: FusionService) -> Non
     output.write_ledger(result / "ledger.bin", core.ledger)
     facts = {
         "digest": core.ledger.map_digest().hex(),
-        "streams": stream_facts(core),
+        "streams": output.stream_facts(core, time.monotonic()),
         "fusion": {
             "maps_served": service.statistics.maps,
             "map_behind_s_p99": service.behind_p99_s(),
@@ -129,20 +129,6 @@ def _write_fusion(result: Path, core: FusionCore, service: FusionService) -> Non
         },
     }
     output.write_json(result / "fusion.json", facts)
-
-
-def stream_facts(core: FusionCore) -> dict[str, dict[str, int]]:
-    """Per vehicle what a report says of its messages."""
-    return {
-        state.name: {
-            "deltas_folded": state.cut + 1,
-            "duplicates": state.duplicates,
-            "gaps_repaired": state.gaps_repaired,
-            "parked": state.parked,
-            "messages_refused": state.refused,
-        }
-        for state in core.states(time.monotonic())
-    }
 
 
 def run_vehicle(

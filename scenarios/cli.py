@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import logging
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,13 +14,13 @@ from rich.logging import RichHandler
 from fleet_seif.errors import NumericalError, RunError
 from fleet_seif.warm_up import warm_up
 from scenarios import children, output, watch
-from scenarios.config import Scenario, ScenarioError, load_scenario, shipped
+from scenarios.config import ScenarioError, load_scenario, shipped
 from scenarios.launch import run_processes
 from scenarios.progress import progress_bars
-from scenarios.report import FinishedRun, evaluate, write_folder
+from scenarios.report import evaluate, write_folder
 from scenarios.source import record
 from scenarios.table import report_table
-from scenarios.virtual import VirtualFleet
+from scenarios.virtual import run_virtual
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
 console = Console()
@@ -82,7 +81,7 @@ def run(
     totals = {name: log.steps for name, log in recording.logs.items()}
     with progress_bars(console, totals, quiet) as progress:
         if virtual:
-            finished = _run_virtual(scenario, chosen, progress)
+            finished = run_virtual(scenario, chosen, recording, progress)
         else:
             again = [scenario, *(part for item in settings or () for part in ("--set", item))]
             again += ["--seed", str(chosen.run.seed)]
@@ -95,23 +94,6 @@ def run(
         console.print(report_table(outcome.report))
         if out is not None:
             say(f"figure: {out / 'figure.png'}   report: {out / 'report.json'}")
-
-
-def _run_virtual(name: str, scenario: Scenario, progress: Callable[[str, int, int], None]) -> FinishedRun:
-    recording = record(scenario)
-    begin = time.monotonic()
-    fleet = VirtualFleet(scenario, recording)
-    drives = fleet.drive(lambda vehicle, step: progress(vehicle, step, recording.logs[vehicle].steps))
-    return FinishedRun(
-        name=name,
-        scenario=scenario,
-        recording=recording,
-        ledger=fleet.fusion.ledger,
-        drives=drives,
-        streams=children.stream_facts(fleet.fusion),
-        wall_s=time.monotonic() - begin,
-        fusion=dict(fleet.fusion.counters),
-    )
 
 
 @app.command()

@@ -10,6 +10,7 @@ import numpy as np
 from fleet_seif.errors import RunError
 from fleet_seif.joint import JointSolution
 from fleet_seif.records import Floats, Ints
+from fusion.core import FusionCore
 from fusion.ledger import Ledger
 from scenarios.recording import Log, Recording
 from vehicles.drive import DriveResult
@@ -102,6 +103,20 @@ def write_map(folder: Path, solution: JointSolution, landmark_cov: Floats, landm
 def write_json(path: Path, value: Mapping[str, object]) -> None:
     """JSON for people and programs, two spaces deep."""
     path.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def stream_facts(core: FusionCore, now_s: float) -> dict[str, dict[str, int]]:
+    """Per vehicle what a report says of its messages."""
+    return {
+        state.name: {
+            "deltas_folded": state.cut + 1,
+            "duplicates": state.duplicates,
+            "gaps_repaired": state.gaps_repaired,
+            "parked": state.parked,
+            "messages_refused": state.refused,
+        }
+        for state in core.states(now_s)
+    }
 
 
 def write_ledger(path: Path, ledger: Ledger) -> None:

@@ -2,6 +2,7 @@
 
 from scenarios import mrclam
 from scenarios.config import Scenario, ScenarioError
+from scenarios.mrclam_files import DatasetError
 from scenarios.recording import Recording
 from scenarios.world import simulate
 
@@ -21,7 +22,7 @@ def record(scenario: Scenario, only: str | None = None) -> Recording:
     if scenario.dataset is not None:
         try:
             return mrclam.load(scenario.dataset, only=only)
-        except mrclam.DatasetError as error:
+        except DatasetError as error:
             raise ScenarioError(str(error)) from None
     assert scenario.world is not None
     names = vehicle_names(scenario)

@@ -18,7 +18,9 @@ from fleet_seif.messages import Epoch
 from fleet_seif.records import Reading
 from fusion.core import AskRange, Effect, FusionCore, PutAck
 from scenarios.config import Scenario
+from scenarios.output import stream_facts
 from scenarios.recording import Log, Recording
+from scenarios.report import FinishedRun
 from vehicles.core import Identity, VehicleCore
 from vehicles.drive import DriveResult, Notes
 
@@ -191,3 +193,25 @@ class _VirtualVehicle:
             core.landmarks, core.filter.signatures, core.counters.bytes_put, core.counters.messages,
             core.counters.readings_refused, core.counters.sightings_refused,
         )  # fmt: skip
+
+
+def run_virtual(
+    name: str,
+    scenario: Scenario,
+    recording: Recording,
+    progress: Callable[[str, int, int], None] = lambda vehicle, done, total: None,
+) -> FinishedRun:
+    """A whole run; progress is called with vehicle, done and total steps. Raises RunError where it cannot finish."""
+    begin = time.monotonic()
+    fleet = VirtualFleet(scenario, recording)
+    drives = fleet.drive(lambda vehicle, step: progress(vehicle, step, recording.logs[vehicle].steps))
+    return FinishedRun(
+        name=name,
+        scenario=scenario,
+        recording=recording,
+        ledger=fleet.fusion.ledger,
+        drives=drives,
+        streams=stream_facts(fleet.fusion, fleet.now_s),
+        wall_s=time.monotonic() - begin,
+        fusion=dict(fleet.fusion.counters),
+    )

@@ -15,8 +15,9 @@ from pydantic import Field, model_validator
 from fleet_seif.config import Positive, Settings
 from fleet_seif.geometry import wrap
 from fleet_seif.records import Floats, Ints
+from scenarios.meetings import meeting_routes
 from scenarios.recording import Log, Recording
-from scenarios.routes import WALL_M, Craft, coverage_routes, meeting_routes
+from scenarios.routes import WALL_M, Craft, coverage_routes
 
 LANDMARKS_PER_M2 = 50.0
 """Of the paper's world; fixes the side of a square whose side is not given."""

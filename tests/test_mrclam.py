@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from fleet_seif.geometry import act_inverse, compose, compose_jacobians, wrap
 from fleet_seif.records import Floats
-from scenarios.mrclam import DatasetError, DatasetSettings, increments, load
+from scenarios.mrclam import DatasetSettings, increments, load
+from scenarios.mrclam_files import DatasetError
 from scenarios.recording import Log, Recording
 from tests import real_data
 

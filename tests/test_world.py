@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from fleet_seif.geometry import between, compose
 from fleet_seif.records import Floats, Ints
-from scenarios import routes
+from scenarios import meetings
 from scenarios.recording import Log, Recording
 from scenarios.routes import NEVER, first_shared_step
 from scenarios.world import NoiseSettings, WorldSettings, simulate
@@ -277,6 +277,6 @@ def test_runs_that_cannot_be_are_refused_with_the_reason(
 
 
 def test_a_search_for_routes_that_finds_none_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(routes, "VISITS_MAX", 3)
+    monkeypatch.setattr(meetings, "VISITS_MAX", 3)
     with pytest.raises(ValueError, match="no routes meet"):
         simulate(WorldSettings(landmarks=1, side_m=1.0), NoiseSettings(), TRIO, 0)
