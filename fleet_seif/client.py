@@ -12,10 +12,11 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 from fleet_seif.bus import ZenohBus, open_bus
+from fleet_seif.envelope import PIECES_MAX
 from fleet_seif.errors import WireError
 from fleet_seif.keys import Keys
+from fleet_seif.map_wire import decode_map, read_piece
 from fleet_seif.messages import JointMap
-from fleet_seif.wire import PIECES_MAX, decode_map, read_piece
 
 log = logging.getLogger(__name__)
 VERSIONS_OPEN_MAX = 4

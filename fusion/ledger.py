@@ -15,18 +15,13 @@ from enum import Enum, auto
 
 import numpy as np
 
+from fleet_seif.envelope import KIND_SNAPSHOT, body_digest, kind_of
 from fleet_seif.errors import NumericalError, WireError
 from fleet_seif.information import FrameTotal, delta_digest
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello, Snapshot
 from fleet_seif.records import Floats
 from fleet_seif.streams import EMPTY_PREFIX, extend_prefix
-from fleet_seif.wire import (
-    KIND_SNAPSHOT,
-    body_digest,
-    decode_message,
-    decode_snapshot,
-    kind_of,
-)
+from fleet_seif.wire import decode_message, decode_snapshot
 
 
 class Receipt(Enum):

@@ -19,8 +19,8 @@ from fleet_seif.bus import Bus
 from fleet_seif.config import FusionSettings
 from fleet_seif.errors import NumericalError
 from fleet_seif.keys import Keys, vehicle_of
+from fleet_seif.map_wire import encode_map, map_pieces
 from fleet_seif.messages import JointMap
-from fleet_seif.wire import encode_map, map_pieces
 from fusion.core import AskRange, Effect, FusionCore, PutAck
 from fusion.mapping import empty_map, make_map, map_input
 

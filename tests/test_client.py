@@ -10,8 +10,8 @@ import fleet_seif
 from fleet_seif.client import MapAssembler
 from fleet_seif.errors import RunError, WireError
 from fleet_seif.keys import Keys
+from fleet_seif.map_wire import encode_map, map_pieces
 from fleet_seif.messages import JointMap, LandmarkName
-from fleet_seif.wire import encode_map, map_pieces
 from fusion.mapping import empty_map
 from tests.conftest import Network
 

@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from fleet_seif.config import PublishSettings
+from fleet_seif.envelope import KIND_DELTA, KIND_SNAPSHOT, kind_of
 from fleet_seif.information import FrameDelta, FrameTotal, delta_digest
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello, RangeRequest
-from fleet_seif.wire import KIND_DELTA, KIND_SNAPSHOT, decode_message, decode_snapshot, encode_range, kind_of
+from fleet_seif.wire import decode_message, decode_snapshot, encode_range
 from fusion.ledger import Ledger, Receipt
 from tests.drives import core_of, drive, square
 from tests.reference import same

@@ -13,12 +13,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
-from fleet_seif import wire
+from fleet_seif import envelope, map_wire, wire
+from fleet_seif.envelope import DIGEST, HEADER, MAGIC, PIECE_BYTES, VERSION
 from fleet_seif.errors import WireError
 from fleet_seif.information import QUANTA_MAX, VARIABLE_MAX
 from fleet_seif.messages import FrameStatus
 from fleet_seif.varints import encode_ints
-from fleet_seif.wire import DIGEST, HEADER, MAGIC, PIECE_BYTES, VERSION
 from tests import strategies
 from tests.drives import streams
 from tests.reference import same
@@ -37,13 +37,13 @@ class Kind:
 
 PIECES = st.tuples(strategies.SEQUENCES, st.integers(0, 9), st.integers(10, 4096), st.binary(max_size=60))
 KINDS = {
-    "delta": Kind(wire.KIND_DELTA, wire.encode_message, wire.decode_message, strategies.messages()),
-    "heartbeat": Kind(wire.KIND_HEARTBEAT, wire.encode_heartbeat, wire.decode_heartbeat, strategies.heartbeats()),
-    "ack": Kind(wire.KIND_ACK, wire.encode_ack, wire.decode_ack, strategies.acks()),
-    "range": Kind(wire.KIND_RANGE, wire.encode_range, wire.decode_range, strategies.ranges()),
-    "snapshot": Kind(wire.KIND_SNAPSHOT, wire.encode_snapshot, wire.decode_snapshot, strategies.snapshots()),
-    "piece": Kind(wire.KIND_PIECE, lambda p: wire._seal(wire.KIND_PIECE, p), wire.read_piece, PIECES),
-    "map": Kind(wire.KIND_MAP, wire.encode_map, wire.decode_map, strategies.maps()),
+    "delta": Kind(envelope.KIND_DELTA, wire.encode_message, wire.decode_message, strategies.messages()),
+    "heartbeat": Kind(envelope.KIND_HEARTBEAT, wire.encode_heartbeat, wire.decode_heartbeat, strategies.heartbeats()),
+    "ack": Kind(envelope.KIND_ACK, wire.encode_ack, wire.decode_ack, strategies.acks()),
+    "range": Kind(envelope.KIND_RANGE, wire.encode_range, wire.decode_range, strategies.ranges()),
+    "snapshot": Kind(envelope.KIND_SNAPSHOT, wire.encode_snapshot, wire.decode_snapshot, strategies.snapshots()),
+    "piece": Kind(envelope.KIND_PIECE, lambda p: envelope.seal(envelope.KIND_PIECE, p), map_wire.read_piece, PIECES),
+    "map": Kind(envelope.KIND_MAP, map_wire.encode_map, map_wire.decode_map, strategies.maps()),
 }
 RECORDS = st.sampled_from(sorted(KINDS)).flatmap(lambda name: st.tuples(st.just(KINDS[name]), KINDS[name].records))
 
@@ -76,7 +76,7 @@ def test_a_record_comes_back_as_it_was(case: tuple[Kind, Any]) -> None:
     data = kind.encode(record)
     assert same(kind.decode(data), record)
     assert kind.encode(kind.decode(data)) == data
-    assert wire.kind_of(data) == kind.number
+    assert envelope.kind_of(data) == kind.number
 
 
 @pytest.mark.parametrize("vehicle", sorted(streams()))
@@ -87,7 +87,7 @@ def test_messages_of_a_filter_come_back_as_they_were(vehicle: str) -> None:
 
 def test_a_map_without_landmarks_and_vehicles_comes_back() -> None:
     fields = [["f", 0, True, False, bytes(32), bytes(32)], [b"", b"", -1], [], [], [[], b"", b""], [], {}]
-    joint = wire.decode_map(sealed(wire.KIND_MAP, msgpack.packb(fields)))
+    joint = map_wire.decode_map(sealed(envelope.KIND_MAP, msgpack.packb(fields)))
     assert joint.landmark_mean.shape == (0, 2)
     assert joint.pose_cov.shape == (0, 3, 3)
 
@@ -98,7 +98,7 @@ def test_the_digest_in_a_message_is_that_of_kind_version_and_body(case: tuple[Ki
     kind, record = case
     data = kind.encode(record)
     body = data[HEADER + DIGEST :]
-    assert wire.body_digest(data) == hashlib.blake2b(data[:HEADER] + body, digest_size=DIGEST).digest()
+    assert envelope.body_digest(data) == hashlib.blake2b(data[:HEADER] + body, digest_size=DIGEST).digest()
 
 
 # Damage.
@@ -210,23 +210,23 @@ def test_another_way_to_write_the_same_is_refused(change: Callable[[bytes], byte
     body = change(data[HEADER + DIGEST :])
     if body == data[HEADER + DIGEST :]:
         body = b"\xdd\x00\x00\x00\x10" + body[3:]
-    assert refused(wire.decode_message, sealed(wire.KIND_DELTA, body))
+    assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, body))
 
 
 @pytest.mark.parametrize("change", list(NOT_CANONICAL.values())[4:], ids=list(NOT_CANONICAL)[4:])
 def test_msgpack_of_types_that_no_message_has_is_refused(change: Callable[[bytes], bytes]) -> None:
     message = dataclasses.replace(wire.decode_message(streams()["ann"][1]), fleet="r")
     body = change(wire.encode_message(message)[HEADER + DIGEST :])
-    assert refused(wire.decode_message, sealed(wire.KIND_DELTA, body))
+    assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, body))
 
 
 def test_deep_nesting_is_refused() -> None:
     for depth in (100, 600, 100_000):
-        assert refused(wire.decode_message, sealed(wire.KIND_DELTA, b"\x91" * depth + b"\xc0"))
+        assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, b"\x91" * depth + b"\xc0"))
 
 
 def test_lists_that_claim_to_be_long_are_refused() -> None:
-    assert refused(wire.decode_message, sealed(wire.KIND_DELTA, (b"\xdd" + (2**20).to_bytes(4, "big")) * 500))
+    assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, (b"\xdd" + (2**20).to_bytes(4, "big")) * 500))
 
 
 # Limits, each by a message that is right but for one number.
@@ -241,7 +241,7 @@ def delta_message(variables: list[int], blocks: list[int], H: list[int], b: list
 
     column = [steps(variables), steps(blocks), encode_ints(np.array(H, np.int64)), encode_ints(np.array(b, np.int64))]
     whole[7] = [[0, 1, column, None]]
-    return sealed(wire.KIND_DELTA, msgpack.packb(whole))
+    return sealed(envelope.KIND_DELTA, msgpack.packb(whole))
 
 
 def test_a_delta_made_by_hand_is_read() -> None:
@@ -287,18 +287,18 @@ def test_steps_that_wrap_around_to_a_small_variable_are_refused() -> None:
     assert np.any(variables < 0)
     whole = fields_of(streams()["ann"][1])
     whole[7] = [[0, 1, [encode_ints(np.array(steps)), b"", b"", encode_ints(np.zeros(2 * len(steps), np.int64))], None]]
-    assert refused(wire.decode_message, sealed(wire.KIND_DELTA, msgpack.packb(whole)))
+    assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, msgpack.packb(whole)))
 
 
 def test_a_message_above_the_size_limit_is_refused_unread() -> None:
-    assert refused(wire.decode_message, MAGIC + bytes([VERSION, wire.KIND_DELTA]) + bytes(wire.MESSAGE_MAX))
+    assert refused(wire.decode_message, MAGIC + bytes([VERSION, envelope.KIND_DELTA]) + bytes(envelope.MESSAGE_MAX))
 
 
 @pytest.mark.parametrize("field", [4, 3])
 def test_a_message_that_ends_before_it_starts_or_lacks_its_hello_is_refused(field: int) -> None:
     whole = fields_of(streams()["ann"][1])
     whole[field] = 0
-    assert refused(wire.decode_message, sealed(wire.KIND_DELTA, msgpack.packb(whole)))
+    assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, msgpack.packb(whole)))
 
 
 def test_another_format_version_says_so() -> None:
@@ -312,12 +312,12 @@ def test_another_format_version_says_so() -> None:
 def test_a_start_covariance_that_is_no_covariance_is_refused(cov: Any) -> None:
     whole = fields_of(streams()["ann"][0])
     whole[14][4] = np.asarray(cov, float).tobytes()
-    assert refused(wire.decode_message, sealed(wire.KIND_DELTA, msgpack.packb(whole)))
+    assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, msgpack.packb(whole)))
 
 
 def test_a_snapshot_starts_at_sequence_zero() -> None:
     fields = [fields_of(streams()["ann"][1]), bytes(32)]
-    assert refused(wire.decode_snapshot, sealed(wire.KIND_SNAPSHOT, msgpack.packb(fields)))
+    assert refused(wire.decode_snapshot, sealed(envelope.KIND_SNAPSHOT, msgpack.packb(fields)))
 
 
 # Pieces.
@@ -327,7 +327,7 @@ def test_a_snapshot_starts_at_sequence_zero() -> None:
 @settled
 def test_pieces_in_any_order_make_the_whole_again(data: bytes, version: int, order: st.DataObject) -> None:
     whole = data * 500
-    pieces = order.draw(st.permutations([wire.read_piece(piece) for piece in wire.map_pieces(whole, version)]))
+    pieces = order.draw(st.permutations([map_wire.read_piece(piece) for piece in map_wire.map_pieces(whole, version)]))
     assert {(v, count) for v, _, count, _ in pieces} <= {(version, len(pieces))}
     assert b"".join(chunk for *_, chunk in sorted(pieces, key=lambda piece: piece[1])) == whole
     assert all(len(chunk) <= PIECE_BYTES for *_, chunk in pieces)
@@ -336,8 +336,8 @@ def test_pieces_in_any_order_make_the_whole_again(data: bytes, version: int, ord
 @given(st.integers(0, 255), st.binary(max_size=10))
 @settled
 def test_the_kind_of_bytes_that_are_not_ours_is_zero(kind: int, rest: bytes) -> None:
-    assert wire.kind_of(b"FSX" + bytes([VERSION, kind]) + rest) == 0
-    assert wire.kind_of(b"") == 0
+    assert envelope.kind_of(b"FSX" + bytes([VERSION, kind]) + rest) == 0
+    assert envelope.kind_of(b"") == 0
 
 
 def test_frame_statuses_keep_their_numbers_on_the_wire() -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fleet_seif.config import PublishSettings
+from fleet_seif.envelope import body_digest
 from fleet_seif.information import FrameDelta, FrameTotal
 from fleet_seif.messages import (
     DeltaMessage,
@@ -24,7 +25,7 @@ from fleet_seif.messages import (
     Snapshot,
 )
 from fleet_seif.streams import EMPTY_PREFIX, Coalescer, extend_prefix
-from fleet_seif.wire import body_digest, encode_message, encode_snapshot
+from fleet_seif.wire import encode_message, encode_snapshot
 
 
 @dataclass(frozen=True, eq=False)
