@@ -58,7 +58,7 @@ def _fail(text: str, code: int) -> None:
 def scenarios() -> None:
     """List the scenarios that come with the package."""
     for name, description in shipped().items():
-        console.print(f"[bold]{name}[/bold]  {description}", highlight=False)
+        console.print(f"[bold]{name}[/bold]  {description}", highlight=False, soft_wrap=True)
 
 
 @app.command()
