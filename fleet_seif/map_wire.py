@@ -1,6 +1,6 @@
 """Bytes of the joint map, whole and in pieces; FORMAT.md is the specification."""
 
-from typing import Any
+from typing import Any, Final
 
 from fleet_seif.envelope import (
     ENTRIES_MAX,
@@ -26,6 +26,8 @@ from fleet_seif.errors import WireError
 from fleet_seif.information import VARIABLE_MAX
 from fleet_seif.messages import JointMap, LandmarkName, VehicleState
 
+COUNTERS_MAX: Final = 256
+
 
 def encode_map(joint: JointMap) -> bytes:
     """Bytes of a JointMap."""
@@ -38,20 +40,20 @@ def encode_map(joint: JointMap) -> bytes:
             joint.signature,
             (joint.poses, raw_bytes(joint.pose_mean), raw_bytes(joint.pose_cov)),
             tuple(_pack_state(state) for state in joint.vehicles),
-            joint.counters,
+            dict(sorted(joint.counters.items())),
         ),
     )
 
 
 def _pack_state(s: VehicleState) -> tuple[object, ...]:
     counts = (s.cut, s.behind, s.parked, s.duplicates, s.gaps_repaired, s.refused)
-    return s.name, s.life, tuple(s.epoch), counts, (s.stalled, s.ended, s.healthy)
+    return s.name, s.life, tuple(s.epoch), counts, (s.placed, s.stalled, s.ended, s.healthy)
 
 
 def _read_state(value: Any) -> VehicleState:
     name, life, epoch, counts, flags = fields_of(value, 5, "vehicle state")
     numbers = [int_of(n, -1, SEQUENCE_MAX, "count") for n in fields_of(counts, 6, "counts")]
-    stalled, ended, healthy = (bool_of(flag, "flag") for flag in fields_of(flags, 3, "flags"))
+    placed, stalled, ended, healthy = (bool_of(flag, "flag") for flag in fields_of(flags, 4, "flags"))
     return VehicleState(
         name=name_of(name, "vehicle"),
         life=int_of(life, 0, VARIABLE_MAX, "life"),
@@ -62,6 +64,7 @@ def _read_state(value: Any) -> VehicleState:
         duplicates=numbers[3],
         gaps_repaired=numbers[4],
         refused=numbers[5],
+        placed=placed,
         stalled=stalled,
         ended=ended,
         healthy=healthy,
@@ -81,8 +84,8 @@ def decode_map(data: bytes) -> JointMap:
     fleet, version, canonical, final, map_digest, ledger_digest = fields_of(head, 6, "map head")
     mean, cov, cov_version = fields_of(landmarks, 3, "map landmarks")
     pose_names, pose_mean, pose_cov = fields_of(poses, 3, "map poses")
-    if not isinstance(counters, dict):
-        raise WireError("map counters: expected a table")
+    if not isinstance(counters, dict) or len(counters) > COUNTERS_MAX or list(counters) != sorted(counters):
+        raise WireError(f"map counters: expected a table of at most {COUNTERS_MAX}, in order of its keys")
     joint = JointMap(
         fleet=name_of(fleet, "fleet"),
         version=int_of(version, 0, SEQUENCE_MAX, "version"),

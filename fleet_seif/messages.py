@@ -145,7 +145,8 @@ class VehicleState:
     """What a fusion node says of one vehicle.
 
     epoch, cut: the last message folded. parked, duplicates, gaps_repaired, refused: messages waiting for an earlier
-    one, received again, obtained by asking, and rejected. behind: messages announced but not folded.
+    one, received again, obtained by asking, and rejected. behind: messages announced but not folded. placed: part of
+    the joint map.
     """
 
     name: str
@@ -157,6 +158,7 @@ class VehicleState:
     duplicates: int
     gaps_repaired: int
     refused: int
+    placed: bool
     stalled: bool
     ended: bool
     healthy: bool
@@ -177,8 +179,8 @@ class JointMap:
     version: grows with every map of a node. landmark_mean (n, 2) m; landmark_cov (n, 2, 2) m^2, empty (0, 2, 2) where
     none has been computed yet; cov_version: the map version that the covariances belong to, -1 for none.
     names: for each landmark, who saw it; signature (n,), -1 unknown. pose_mean (v, 3), pose_cov (v, 3, 3) in the
-    order of `poses`, the names of the placed vehicles. age_s: how old the newest message in it was when it was
-    solved. canonical: replayed in canonical order, and so equal on every node that holds the same messages.
+    order of `poses`, the names of the placed vehicles. canonical: replayed in canonical order,
+    and so equal on every node that holds the same messages.
     """
 
     fleet: str

@@ -233,10 +233,10 @@ def quantise(H: Floats, b: Floats, mu: Floats, entries: Ints) -> tuple[Ints, Int
         load = 0.5 * entries[i]
         for j in range(i, n):
             value = np.rint(H[i, j] * (1.0 / H_QUANTUM) + (load if i == j else 0.0))
-            fits = fits and abs(value) < QUANTA_MAX
+            fits = fits and abs(value) < QUANTA_MAX // 2
             q_H[i, j] = q_H[j, i] = np.int64(value) if fits else 0
         value = np.rint((b[i] + load * H_QUANTUM * mu[i]) * (1.0 / B_QUANTUM))
-        fits = fits and abs(value) < QUANTA_MAX
+        fits = fits and abs(value) < QUANTA_MAX // 2
         q_b[i] = np.int64(value) if fits else 0
     return q_H, q_b, fits
 
@@ -427,7 +427,7 @@ def seif_step(
     s: SeifArrays, model: int, moves: bool, u: Floats, cov: Floats, sighted: Ints, z: Floats, Z: Floats,
     active_max: int, others: int, gate: float, patience: int,
 ) -> tuple[int, Floats, Ints, Ints, Ints, Ints, Ints]:  # fmt: skip
-    """One step: motion (if `moves`), sightings of landmarks `sighted`, sparsification, mean recovery, delta.
+    """One step: motion (if `moves`), sightings of landmarks `sighted`, mean recovery, sparsification, delta.
 
     Landmark numbers from counts[LANDMARKS] on are new; capacities must suffice.
 
@@ -459,8 +459,10 @@ def seif_step(
             mu[at[k] : at[k] + 2] = place(model, mu[:3], z[k])
         if accepted[k]:
             measurement_update_into(H, b, mu, model, z[k], Z[k], at[k])
+    if not recover_mean_into(mu, H, b, pull):
+        return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
     drop = weakest_links(H, active_max)
-    if (len(drop) > 0 and not sparsify_into(H, b, mu, drop)) or not recover_mean_into(mu, H, b, pull):
+    if len(drop) > 0 and not sparsify_into(H, b, mu, drop):
         return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
     if not np.all(np.isfinite(mu)):
         return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none

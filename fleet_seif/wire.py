@@ -136,6 +136,9 @@ def _read_hello(value: Any) -> Hello:
             last=int_of(last, 0, SEQUENCE_MAX, "continues"),
             prefix_digest=digest_of(digest, "prefix"),
         )
+    information_max = float_of(information, "sighting information")
+    if not information_max > 0:
+        raise WireError("sighting information: expected a positive number")
     start_pose_cov = array_of(cov, (3, 3), "start pose covariance")
     if np.any(start_pose_cov) and not (
         np.array_equal(start_pose_cov, start_pose_cov.T) and np.linalg.eigvalsh(start_pose_cov)[0] > 0
@@ -147,7 +150,7 @@ def _read_hello(value: Any) -> Hello:
         placed=bool_of(placed, "placed"),
         start_pose=array_of(pose, (3,), "start pose"),
         start_pose_cov=start_pose_cov,
-        sighting_information_max=float_of(information, "sighting information"),
+        sighting_information_max=information_max,
         sightings_max=int_of(sightings, 1, ENTRIES_MAX, "sightings"),
         continues=continues,
     )

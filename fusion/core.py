@@ -96,10 +96,10 @@ class FusionCore:
             heartbeat = decode_heartbeat(data)
             if heartbeat.vehicle != vehicle:
                 raise WireError(f"heartbeat of {heartbeat.vehicle!r} under the key of {vehicle!r}")
+            stream = self.ledger.stream(vehicle, heartbeat.epoch)
         except WireError:
             self.counters["malformed"] += 1
             return []
-        stream = self.ledger.stream(vehicle, heartbeat.epoch)
         link = self._link(stream)
         link.heard_s = now_s
         link.announced = max(link.announced, heartbeat.last)
@@ -173,9 +173,10 @@ class FusionCore:
 
     def states(self, now_s: float) -> tuple[VehicleState, ...]:
         """Every stream that is known, by vehicle and epoch."""
-        return tuple(self._state(key, link, now_s) for key, link in sorted(self._links.items()))
+        placed = {(stream.vehicle, stream.epoch) for stream in self.ledger.placed()}
+        return tuple(self._state(key, link, now_s, key in placed) for key, link in sorted(self._links.items()))
 
-    def _state(self, key: tuple[str, Epoch], link: Link, now_s: float) -> VehicleState:
+    def _state(self, key: tuple[str, Epoch], link: Link, now_s: float, placed: bool) -> VehicleState:
         stream = self.ledger.streams[key]
         return VehicleState(
             name=stream.vehicle,
@@ -187,6 +188,7 @@ class FusionCore:
             duplicates=stream.duplicates,
             gaps_repaired=link.repaired,
             refused=stream.refused,
+            placed=placed,
             stalled=not stream.ended and now_s - link.heard_s > self._settings.stalled_s,
             ended=stream.ended,
             healthy=stream.healthy and stream.fault is None,

@@ -5,13 +5,15 @@
 3. Two messages of one stream whose ranges overlap and whose bodies differ are refused and counted: the first one stays.
 4. A snapshot replaces a shorter prefix of its stream.
 5. A stream whose next message cannot be folded stays at its prefix; `fault` says why.
-6. The same messages in any order, with any duplication, leave the same totals and digests.
-7. No I/O and no clock: bytes in, totals out.
+6. A vehicle that starts again without its outbox begins a new epoch of the same life: it is kept, not placed.
+7. The same messages in any order, with any duplication, leave the same totals and digests.
+8. No I/O and no clock: bytes in, totals out.
 """
 
 import hashlib
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from typing import Final
 
 import numpy as np
 
@@ -22,6 +24,8 @@ from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hel
 from fleet_seif.records import Floats
 from fleet_seif.streams import EMPTY_PREFIX, extend_prefix
 from fleet_seif.wire import decode_message, decode_snapshot
+
+STREAMS_MAX: Final = 1000
 
 
 class Receipt(Enum):
@@ -82,9 +86,11 @@ class Ledger:
         self._parked_max = parked_max
 
     def stream(self, vehicle: str, epoch: Epoch) -> Stream:
-        """The stream of an epoch, empty if nothing is known of it."""
+        """The stream of an epoch, empty if nothing is known of it. Raises WireError at the limit of streams."""
         key = (vehicle, epoch)
         if key not in self.streams:
+            if len(self.streams) >= STREAMS_MAX:
+                raise WireError(f"epoch {epoch} of {vehicle!r}: {STREAMS_MAX} epochs are known, no more are taken")
             self.streams[key] = Stream(vehicle=vehicle, epoch=epoch)
         return self.streams[key]
 
@@ -189,9 +195,12 @@ class Ledger:
         return Receipt.FOLDED, fresh
 
     def placed(self) -> list[Stream]:
-        """The streams that the canonical map is made from, in canonical order."""
+        """The streams that the canonical map is made from, in canonical order: of each life its first epoch."""
         usable = [s for s in self.streams.values() if s.hello is not None and s.hello.placed and s.healthy]
-        return sorted(usable, key=lambda s: (s.vehicle, s.life, s.epoch))
+        first: dict[tuple[str, int], Stream] = {}
+        for stream in sorted(usable, key=lambda s: (s.vehicle, s.life, s.epoch)):
+            first.setdefault((stream.vehicle, stream.life), stream)
+        return list(first.values())
 
     def ledger_digest(self) -> bytes:
         """32 bytes that identify all that has been folded."""

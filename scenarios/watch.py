@@ -51,14 +51,15 @@ def as_dict(joint: JointMap) -> dict[str, Any]:
             for i, names in enumerate(joint.names)
         ],
         "poses": {name: joint.pose_mean[i].tolist() for i, name in enumerate(joint.poses)},
-        "vehicles": {
-            state.name: {
-                "cut": state.cut, "behind": state.behind, "parked": state.parked, "duplicates": state.duplicates,
-                "gaps_repaired": state.gaps_repaired, "refused": state.refused, "stalled": state.stalled,
-                "ended": state.ended, "healthy": state.healthy,
+        "vehicles": [
+            {
+                "name": state.name, "life": state.life, "cut": state.cut, "behind": state.behind,
+                "parked": state.parked,
+                "duplicates": state.duplicates, "gaps_repaired": state.gaps_repaired, "refused": state.refused,
+                "placed": state.placed, "stalled": state.stalled, "ended": state.ended, "healthy": state.healthy,
             }
             for state in joint.vehicles
-        },
+        ],
         "counters": joint.counters,
     }  # fmt: skip
 
@@ -70,7 +71,7 @@ def picture(joint: JointMap) -> RenderableType:
         table.add_column(head, justify="left" if head in ("vehicle", "state") else "right")
     for s in joint.vehicles:
         state = "ended" if s.ended else "stalled" if s.stalled else "mapping"
-        state += "" if s.healthy else ", doubtful"
+        state += ("" if s.healthy else ", doubtful") + ("" if s.placed else ", not placed")
         counts = (s.cut + 1, s.behind, s.parked, s.duplicates, s.gaps_repaired, s.refused)
         table.add_row(s.name, *(str(count) for count in counts), state)
     deviation = ""

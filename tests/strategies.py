@@ -117,7 +117,7 @@ def hellos() -> SearchStrategy[Hello]:
         placed=st.booleans(),
         start_pose=table(3),
         start_pose_cov=covariances(),
-        sighting_information_max=FLOATS,
+        sighting_information_max=st.floats(1e-3, 1e12),
         sightings_max=st.integers(1, 2**20),
         continues=st.one_of(st.none(), continues),
     )
@@ -181,6 +181,7 @@ def states() -> SearchStrategy[VehicleState]:
         refused=count,
         stalled=st.booleans(),
         ended=st.booleans(),
+        placed=st.booleans(),
         healthy=st.booleans(),
     )
 
@@ -207,7 +208,7 @@ def maps(draw: st.DrawFn) -> JointMap:
         pose_mean=draw(table(v, 3)),
         pose_cov=draw(table(draw(st.sampled_from([0, v])), 3, 3)),
         vehicles=tuple(draw(st.lists(states(), max_size=2))),
-        counters=draw(st.dictionaries(st.text(max_size=20), SEQUENCES, max_size=3)),
+        counters=dict(sorted(draw(st.dictionaries(st.text(max_size=20), SEQUENCES, max_size=3)).items())),
     )
 
 

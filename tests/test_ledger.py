@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_seif.config import FilterSettings, PublishSettings
 from fleet_seif.errors import WireError
 from fleet_seif.information import QUANTA_MAX, FrameDelta, delta_digest
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Snapshot
@@ -19,6 +20,7 @@ from fusion.ledger import Ledger, Receipt, Stream
 from tests import reference, strategies
 from tests.drives import FLEET, VEHICLES, core_of, streams
 from tests.strategies import settled
+from vehicles.core import Identity, VehicleCore
 
 EPOCH = Epoch(1, 77)
 ALL = [(vehicle, k) for vehicle in VEHICLES for k in range(len(streams()[vehicle]))]
@@ -426,3 +428,37 @@ def test_every_run_of_a_vehicle_starts_a_stream_of_its_own() -> None:
     core.start(0.0, Sightings.none())
     ledger.accept(core.release()[0])
     assert [(s.vehicle, s.life) for s in ledger.placed()] == [("ann", 0), ("ann", 1)]
+
+
+def test_a_vehicle_that_starts_again_without_its_outbox_is_kept_but_not_placed() -> None:
+    """Its new epoch is of the same life; placing both would count its start twice."""
+    ledger = Ledger("fleet", 10)
+    first, again = (streams_of_epoch(Epoch(counter, 5)) for counter in (1, 2))
+    for data in first:
+        ledger.accept(data)
+    before = ledger.map_digest()
+    for data in again:
+        ledger.accept(data)
+    assert [stream.epoch.counter for stream in ledger.placed()] == [1]
+    assert len(ledger.streams) == 2
+    assert ledger.map_digest() == before
+
+
+def test_the_number_of_epochs_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fusion.ledger.STREAMS_MAX", 1)
+    ledger = Ledger("fleet", 10)
+    ledger.accept(streams_of_epoch(Epoch(1, 5))[0])
+    with pytest.raises(WireError, match="no more are taken"):
+        ledger.accept(streams_of_epoch(Epoch(2, 5))[0])
+
+
+def streams_of_epoch(epoch: Epoch) -> list[bytes]:
+    """A short stream of vehicle v in fleet "fleet"."""
+    identity = Identity(
+        fleet="fleet", vehicle="v", epoch=epoch, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3))
+    )
+    core = VehicleCore(identity, FilterSettings(), PublishSettings())
+    seen = Sightings(z=np.array([[1.0, 0.2]]), cov=np.array([1e-3 * np.eye(2)]), signature=np.array([3]))
+    core.start(0.0, seen)
+    core.end()
+    return core.release()

@@ -216,7 +216,7 @@ def test_a_subscriber_sees_the_map_grow_to_the_final_one() -> None:
     maps = [json.loads(line) for line in lines.splitlines()]
     assert maps[-1]["final"]
     assert [m["version"] for m in maps] == sorted({m["version"] for m in maps})
-    assert maps[-1]["vehicles"]["v1"]["cut"] == 61
+    assert [(v["name"], v["cut"], v["placed"]) for v in maps[-1]["vehicles"]] == [("v1", 61, True)]
 
 
 @pytest.mark.parametrize(

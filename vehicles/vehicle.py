@@ -35,6 +35,7 @@ class Vehicle:
         name, fleet: who it is; 1 to 32 of the characters A-Z a-z 0-9 _ -.
         start_pose: T_0 in the world, (x m, y m, theta rad).
         start_pose_cov: its covariance, (3, 3); None: the start pose is given.
+        epoch: of this run; by default this machine's time in ms, so that a later run counts as later, and a nonce.
         bus: an open bus (fleet_seif.bus.open_bus), or None to map alone.
     """
 
@@ -55,7 +56,7 @@ class Vehicle:
         identity = Identity(
             fleet=fleet,
             vehicle=name,
-            epoch=epoch or Epoch(0, secrets.randbits(64)),
+            epoch=epoch or Epoch(time.time_ns() // 1_000_000, secrets.randbits(64)),
             start_pose=np.asarray(start_pose, float),
             start_pose_cov=np.zeros((3, 3)) if start_pose_cov is None else np.asarray(start_pose_cov, float),
         )
