@@ -107,7 +107,7 @@ class Seif:
         if code == kernels.NOT_POSITIVE_DEFINITE:
             raise NumericalError("the filter's local information matrix is not positive definite: reading refused")
         if code == kernels.TOO_LARGE:
-            raise NumericalError(f"a number would exceed {QUANTA_MAX} quanta (H 2^-28, b 2^-24): reading refused")
+            raise NumericalError(f"a number would exceed {QUANTA_MAX // 2} quanta (H 2^-28, b 2^-24): reading refused")
         self.signatures.extend(new)
         self._number.update({signature: first_new + i for i, signature in enumerate(new)})
         variables, rows, cols, H, b = delta

@@ -453,3 +453,33 @@ def test_kernels_run_as_ordinary_python_too_with_the_same_result(tmp_path: Path)
         for name in ("H", "b"):
             scale = float(np.max(np.abs(getattr(delta, name))))
             np.testing.assert_allclose(plain[name], getattr(delta, name), rtol=1e-12, atol=1e-12 * scale)
+
+
+def test_two_kilometres_from_the_start_the_quanta_move_the_mean_by_less_than_a_thousandth_of_sigma() -> None:
+    """The load on the diagonal pulls towards zero unless b is loaded too: far from the origin it would show."""
+    seif, total = Seif(FilterSettings(active_max=4)), FrameTotal()
+    rng = np.random.default_rng(4)
+    places = np.column_stack([np.arange(0.0, 2000.0, 10.0), rng.uniform(-8.0, 8.0, 200)])
+    pose = np.zeros(3)
+    total.add(seif.start(seen_from(places, pose)).delta)
+    for k in range(1, 401):
+        pose = pose + np.array([5.0, 0.0, 0.0])
+        motion = np.array([5.0, 0.0, 0.0]) + rng.normal(size=3) * [0.05, 1e-3, 1e-3]
+        cov = np.diag([0.05, 1e-3, 1e-3]) ** 2
+        reading = Reading(time_s=float(k), odometry=motion, odometry_cov=cov, sightings=seen_from(places, pose))
+        total.add(seif.step(reading).delta)
+    H, b = seif.information()
+    exact = np.linalg.solve(H.toarray(), b)
+    info = to_information(total.delta())
+    published = np.linalg.solve(info.H.toarray(), info.b)
+    sigma = np.sqrt(np.diag(np.linalg.inv(H.toarray())))
+    assert exact[3::2].max() > 1900.0
+    assert np.max(np.abs(published - exact) / sigma) < 1e-3
+
+
+def seen_from(places: Floats, pose: Floats) -> Sightings:
+    """Exact sightings of the places within 25 m."""
+    d = places - pose[:2]
+    near = np.flatnonzero((np.hypot(*d.T) < 25.0) & (np.hypot(*d.T) > 1.0))
+    z = np.column_stack([np.hypot(*d[near].T), np.arctan2(d[near, 1], d[near, 0]) - pose[2]])
+    return Sightings(z=z, cov=np.tile(np.diag([0.04, 1e-4]), (len(near), 1, 1)), signature=near)
