@@ -10,7 +10,7 @@ import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import zenoh
 
@@ -23,7 +23,7 @@ OnQuery = Callable[[str, bytes], list[bytes]]
 CONNECT_MS = 5000
 QUERY_MS = 2000
 LEASE_MS = 2000
-CHANNEL_MAX = 100_000
+Mode = Literal["router", "client"]
 
 
 class Bus(Protocol):
@@ -92,13 +92,20 @@ def _configuration(mode: str, listen: Sequence[str], connect: Sequence[str], fil
         "connect/timeout_ms": CONNECT_MS,
         "adminspace/enabled": True,
     }
-    if listen or not file:
+    if listen or mode == "client" or not file:
         values["listen/endpoints"] = list(listen)
     if connect or not file:
         values["connect/endpoints"] = list(connect)
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _endpoints_of(configuration: zenoh.Config, key: str) -> list[str]:
+    found = json.loads(configuration.get_json(f"{key}/endpoints"))
+    if isinstance(found, dict):  # one list for each mode
+        found = [endpoint for endpoints in found.values() for endpoint in endpoints]
+    return list(found)
 
 
 class ZenohBus:
@@ -156,14 +163,26 @@ class ZenohBus:
 
 @contextlib.contextmanager
 def open_bus(
-    *, listen: Sequence[str] = (), connect: Sequence[str] = (), config: Path | None = None, insecure: bool = False
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    config: Path | None = None,
+    insecure: bool = False,
+    mode: Mode | None = None,
 ) -> Iterator[ZenohBus]:
-    """A Zenoh session: a router that others connect to where `listen` is given, a client of one otherwise.
+    """A Zenoh session: a router that others connect to, or a client of one.
+
+    Args:
+        listen, connect: endpoints; where empty, those of the configuration file, if there is one.
+        mode: by default a router where `listen` is given, a client otherwise.
 
     Raises RunError where an endpoint is malformed, taken, not reachable or not protected.
     """
+    mode = mode or ("router" if listen else "client")
     check_endpoints([*listen, *connect], insecure)
-    configuration = _configuration("router" if listen else "client", listen, connect, config)
+    configuration = _configuration(mode, listen, connect, config)
+    listen, connect = _endpoints_of(configuration, "listen"), _endpoints_of(configuration, "connect")
+    check_endpoints([*listen, *connect], insecure)
     try:
         session = zenoh.open(configuration)
     except Exception as error:  # zenoh raises its own kind for anything that goes wrong here

@@ -8,18 +8,20 @@ async with fleet_seif.connect("tcp/127.0.0.1:7447", fleet="demo") as fleet:
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
 from fleet_seif.bus import ZenohBus, open_bus
-from fleet_seif.envelope import PIECES_MAX
-from fleet_seif.errors import WireError
+from fleet_seif.errors import RunError, WireError
 from fleet_seif.keys import Keys
 from fleet_seif.map_wire import decode_map, read_piece
 from fleet_seif.messages import JointMap
 
 log = logging.getLogger(__name__)
 VERSIONS_OPEN_MAX = 4
+GONE_S = 5.0
+LOOK_S = 1.0
 
 
 class MapAssembler:
@@ -34,11 +36,12 @@ class MapAssembler:
         version, index, count, chunk = read_piece(data)
         if version <= self._newest:
             return None
-        pieces = self._open.setdefault((version, count), {})
+        pieces = self._open.pop((version, count), {})
         pieces[index] = chunk
+        self._open[version, count] = pieces
         while len(self._open) > VERSIONS_OPEN_MAX:
-            del self._open[min(self._open)]
-        if len(pieces) < count or count > PIECES_MAX:
+            del self._open[next(iter(self._open))]  # the one that was longest without news
+        if len(pieces) < count:
             return None
         joint = decode_map(b"".join(pieces[i] for i in range(count)))
         self._newest = version
@@ -61,15 +64,18 @@ class FleetClient:
         self._loop = asyncio.get_running_loop()
         self._assembler = MapAssembler()
         self._newest: JointMap | None = None
-        self._changed = asyncio.Event()
-        self._keys = Keys(fleet)
-        self._bus = bus
-        bus.subscribe(self._keys.map(), lambda _, data: self._hand_over(data, whole=False))
-        bus.ask(self._keys.map(), b"", lambda data: self._hand_over(data, whole=True), lambda: None)
+        self._nodes: set[str] = set()
+        self._gone_at_s: float | None = None
+        self._changed = asyncio.Condition()
+        self._tasks: set[asyncio.Task[None]] = set()
+        keys = Keys(fleet)
+        bus.subscribe(keys.map(), lambda _, data: self._hand_over(self._take, data, False))
+        bus.watch(keys.node("*"), lambda key, alive: self._hand_over(self._note_node, key, alive))
+        bus.ask(keys.map(), b"", lambda data: self._hand_over(self._take, data, True), lambda: None)
 
-    def _hand_over(self, data: bytes, *, whole: bool) -> None:
+    def _hand_over(self, handle: Callable[[Any, bool], None], what: bytes | str, flag: bool) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has closed: nobody is waiting any more
-            self._loop.call_soon_threadsafe(self._take, data, whole)
+            self._loop.call_soon_threadsafe(handle, what, flag)
 
     def _take(self, data: bytes, whole: bool) -> None:
         try:
@@ -79,24 +85,42 @@ class FleetClient:
             return
         if joint is not None:
             self._newest = joint
-            self._changed.set()
+            self._wake()
+
+    def _note_node(self, key: str, alive: bool) -> None:
+        (self._nodes.add if alive else self._nodes.discard)(key)
+        self._gone_at_s = None if self._nodes else self._loop.time()
+        self._wake()
+
+    def _wake(self) -> None:
+        async def notify() -> None:
+            async with self._changed:
+                self._changed.notify_all()
+
+        task = self._loop.create_task(notify())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def maps(self) -> AsyncIterator[JointMap]:
         """The current map, then the newest one whenever there is one; maps in between are skipped.
 
-        Ends after the final map of a run that ends.
+        Ends after the final map of a run that ends. Raises RunError where the fusion node goes and stays away.
         """
-        seen = None
+        seen: JointMap | None = None
         while True:
-            await self._changed.wait()
-            self._changed.clear()
             joint = self._newest
-            if joint is None or joint is seen:
+            if joint is not None and joint is not seen:
+                seen = joint
+                yield joint
+                if joint.final:
+                    return
                 continue
-            seen = joint
-            yield joint
-            if joint.final:
-                return
+            if self._gone_at_s is not None and self._loop.time() > self._gone_at_s + GONE_S:
+                raise RunError(f"the fusion node has been away for {GONE_S:.0f} s: is it still running?")
+            with contextlib.suppress(TimeoutError):
+                async with self._changed:
+                    if self._newest is seen:
+                        await asyncio.wait_for(self._changed.wait(), LOOK_S)
 
 
 @contextlib.asynccontextmanager

@@ -30,6 +30,10 @@ class Keys:
         """Acknowledgements for a vehicle are put here."""
         return f"{self._stem}/vehicle/{vehicle}/ack"
 
+    def node(self, node: str) -> str:
+        """Liveliness token of a fusion node; `*` for all."""
+        return f"{self._stem}/node/{node}"
+
     def map(self) -> str:
         """Maps are put here in pieces, and queried whole."""
         return f"{self._stem}/map"

@@ -79,15 +79,18 @@ class Seif:
         """One reading: motion, sightings, sparsification, mean recovery.
 
         Raises:
-            ReadingRefused: the reading is malformed.
-            NumericalError: the filter's matrix would not stay positive definite, or a number outgrew 2^60 quanta.
+            ReadingRefused: the reading is malformed, or a sum would outgrow the fixed point.
+            NumericalError: the filter's matrix would not stay positive definite.
         """
         return self._step(True, reading.odometry, reading.odometry_cov, reading.sightings)
 
     def _step(self, moves: bool, u: Floats, cov: Floats, seen: Sightings) -> StepResult:
         # fresh copies: another layout or a read-only array would make numba compile the step once more
         u, cov, z, Z = (np.array(array, np.float64, order="C") for array in (u, cov, seen.z, seen.cov))
-        count = len(seen.signature)
+        signature = np.asarray(seen.signature)
+        if signature.ndim != 1 or (len(signature) and not np.issubdtype(signature.dtype, np.integer)):
+            raise ReadingRefused("reading refused: signatures must be a flat array of integers")
+        count = len(signature)
         shapes = (u.shape, cov.shape, z.shape, Z.shape)
         if shapes != ((3,), (3, 3), (count, 2), (count, 2, 2)):
             raise ReadingRefused(
@@ -95,7 +98,7 @@ class Seif:
                 f" covariances {shapes[3]} for {count} signatures; expected (3,), (3, 3), (s, 2), (s, 2, 2)"
             )
         first_new = int(self._s.counts[kernels.LANDMARKS])
-        numbers, new = self._numbers(seen.signature, first_new)
+        numbers, new = self._numbers(signature, first_new)
         self._reserve(len(new), len(numbers))
         settings = self.settings
         code, statistics, *delta = kernels.seif_step(
@@ -107,7 +110,10 @@ class Seif:
         if code == kernels.NOT_POSITIVE_DEFINITE:
             raise NumericalError("the filter's local information matrix is not positive definite: reading refused")
         if code == kernels.TOO_LARGE:
-            raise NumericalError(f"a number would exceed {QUANTA_MAX // 2} quanta (H 2^-28, b 2^-24): reading refused")
+            raise ReadingRefused(
+                f"reading refused: a sum would exceed {QUANTA_MAX // 2} quanta (H 2^-28, b 2^-24); a sighting claims"
+                " too much information, or a landmark has been seen too often with too small a covariance"
+            )
         self.signatures.extend(new)
         self._number.update({signature: first_new + i for i, signature in enumerate(new)})
         variables, rows, cols, H, b = delta

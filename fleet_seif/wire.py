@@ -3,7 +3,7 @@
 Writer and reader of each record stand side by side. Readers raise WireError, nothing else.
 """
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -45,8 +45,11 @@ from fleet_seif.messages import (
     RangeRequest,
     Snapshot,
 )
-from fleet_seif.records import Ints
+from fleet_seif.records import Floats, Ints
 from fleet_seif.varints import decode_ints, encode_ints
+
+CORRELATION_MARGIN: Final = 1e-9
+"""Least eigenvalue of a start pose's correlation matrix."""
 
 
 @kernel
@@ -127,6 +130,14 @@ def _pack_hello(hello: Hello) -> tuple[object, ...]:
     )
 
 
+def is_start_covariance(cov: Floats) -> bool:
+    """Whether a start pose's covariance is symmetric and clearly positive definite: its inverse becomes a prior."""
+    if not np.array_equal(cov, cov.T):
+        return False
+    scale = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    return bool(np.all(scale > 0) and np.linalg.eigvalsh(cov / np.outer(scale, scale))[0] > CORRELATION_MARGIN)
+
+
 def _read_hello(value: Any) -> Hello:
     software, life, placed, pose, cov, information, sightings, continues = fields_of(value, 8, "hello")
     if continues is not None:
@@ -140,9 +151,7 @@ def _read_hello(value: Any) -> Hello:
     if not information_max > 0:
         raise WireError("sighting information: expected a positive number")
     start_pose_cov = array_of(cov, (3, 3), "start pose covariance")
-    if np.any(start_pose_cov) and not (
-        np.array_equal(start_pose_cov, start_pose_cov.T) and np.linalg.eigvalsh(start_pose_cov)[0] > 0
-    ):
+    if np.any(start_pose_cov) and not is_start_covariance(start_pose_cov):
         raise WireError("start pose covariance: neither zeros nor symmetric and positive definite")
     return Hello(
         software=text_of(software, "software"),

@@ -7,6 +7,7 @@
 4. Times are this node's own monotonic clock; nothing compares them with another's.
 """
 
+import logging
 from collections import Counter
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from fleet_seif.messages import Ack, Epoch, RangeRequest, VehicleState
 from fleet_seif.wire import decode_heartbeat, encode_ack, encode_range
 from fusion.ledger import Ledger, Receipt, Stream
 
+log = logging.getLogger(__name__)
 QUERY_LOST_S = 4.0
 
 
@@ -61,7 +63,7 @@ class FusionCore:
         self.ledger = Ledger(fleet, settings.parked_max)
         self.counters: Counter[str] = Counter()
         self.changed = False
-        self._node = node
+        self.node = node
         self._settings = settings
         self._expected = expected
         self._links: dict[tuple[str, Epoch], Link] = {}
@@ -77,9 +79,10 @@ class FusionCore:
     def _take(self, vehicle: str, data: bytes, now_s: float, *, repair: bool) -> list[Effect]:
         try:
             receipt, stream = self.ledger.accept(data, vehicle)
-        except WireError:
-            self.counters["malformed"] += 1
-            return []
+        except WireError as error:
+            return self._malformed(vehicle, error)
+        if receipt is Receipt.REFUSED:
+            log.warning("message_refused vehicle=%s next=%d fault=%s", vehicle, stream.next, stream.fault)
         link = self._link(stream)
         link.heard_s = now_s
         if receipt is Receipt.FOLDED:
@@ -97,15 +100,19 @@ class FusionCore:
             if heartbeat.vehicle != vehicle:
                 raise WireError(f"heartbeat of {heartbeat.vehicle!r} under the key of {vehicle!r}")
             stream = self.ledger.stream(vehicle, heartbeat.epoch)
-        except WireError:
-            self.counters["malformed"] += 1
-            return []
+        except WireError as error:
+            return self._malformed(vehicle, error)
         link = self._link(stream)
         link.heard_s = now_s
         link.announced = max(link.announced, heartbeat.last)
         if stream.next > 0:
             link.ack_due_s = now_s  # an acknowledgement may have been lost: repeat it
         return self._acknowledge(stream, link, now_s) + self._repair(stream, link, now_s)
+
+    def _malformed(self, vehicle: str, error: WireError) -> list[Effect]:
+        self.counters["malformed"] += 1
+        log.warning("malformed vehicle=%s reason=%s", vehicle, error)
+        return []
 
     def on_reply_done(self, vehicle: str, epoch: Epoch, now_s: float) -> list[Effect]:
         """A range query is over: ask on at once after progress, later without."""
@@ -145,7 +152,7 @@ class FusionCore:
         """The acknowledgement of all that is folded of a stream, whatever has been sent before."""
         stream = self.ledger.stream(vehicle, epoch)
         ack = Ack(
-            node=self._node,
+            node=self.node,
             vehicle=vehicle,
             epoch=epoch,
             last=max(stream.next - 1, 0),

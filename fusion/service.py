@@ -26,9 +26,10 @@ from fusion.mapping import empty_map, make_map, map_input
 
 log = logging.getLogger(__name__)
 INBOX_MAX = 50_000
+BURST_MAX = 256
 TICK_S = 0.02
 PROGRESS_S = 0.2
-LINGER_S = 5.0
+LINGER_S = 30.0
 
 Event = Callable[[], list[Effect]]
 
@@ -44,7 +45,12 @@ class Statistics:
 
 
 class FusionService:
-    """See the rules above."""
+    """See the rules above.
+
+    Args:
+        bus: what vehicles are reached by. maps: what subscribers are reached by, where that is another.
+        first_version: of its maps; one above those of an earlier node of this fleet lets subscribers go on.
+    """
 
     def __init__(
         self,
@@ -53,8 +59,11 @@ class FusionService:
         fleet: str,
         settings: FusionSettings,
         clock: Callable[[], float] = time.monotonic,
+        maps: Bus | None = None,
+        first_version: int = 0,
     ) -> None:
         self._bus = bus
+        self._maps = maps or bus
         self._core = core
         self._fleet = fleet
         self._settings = settings
@@ -67,12 +76,13 @@ class FusionService:
         self._alive: set[str] = set()
         self._changed_at_s: float | None = None
         self._served = b""
-        self.newest: JointMap = empty_map(fleet)
+        self.newest: JointMap = empty_map(fleet, first_version - 1)
         self.statistics = Statistics()
         bus.subscribe(self._keys.deltas("*"), self._on_delta)
         bus.subscribe(self._keys.heartbeats("*"), self._on_heartbeat)
         bus.watch(self._keys.alive("*"), self._on_alive)
-        bus.answer(self._keys.map(), lambda key, data: [self._served] if self._served else [])
+        self._maps.answer(self._keys.map(), lambda key, data: [self._served] if self._served else [])
+        self._maps.announce(self._keys.node(core.node))
 
     def _post(self, event: Event) -> None:
         if self._inbox.qsize() < INBOX_MAX:
@@ -108,12 +118,14 @@ class FusionService:
             self._over.set()
             solver.join()
         if self._core.complete:
-            for vehicle, epoch in self._core.ledger.streams:
-                self._execute(self._core.ack_now(vehicle, epoch))
+            for (vehicle, epoch), stream in self._core.ledger.streams.items():
+                if stream.next > 0:
+                    self._execute(self._core.ack_now(vehicle, epoch))
             self._serve(final=True)
             end_s = self._clock() + LINGER_S
             while self._alive and self._clock() < end_s and not self._stop.is_set():
                 self._work()
+            self._publish()  # once more: pieces of the only final map may have been dropped
         return self.newest
 
     def stop(self) -> None:
@@ -121,17 +133,20 @@ class FusionService:
         self._stop.set()
 
     def _work(self) -> None:
-        """Handle what is in the inbox, or what is due."""
+        """Handle a part of what is in the inbox, and what is due."""
         effects: list[Effect] = []
         try:
-            event = self._inbox.get(timeout=TICK_S)
-            with self._lock:
-                for _ in range(256):
-                    effects += event()
-                    event = self._inbox.get_nowait()
+            events = [self._inbox.get(timeout=TICK_S)]
         except queue.Empty:
-            pass
+            events = []
+        while events and len(events) < BURST_MAX:
+            try:
+                events.append(self._inbox.get_nowait())
+            except queue.Empty:
+                break
         with self._lock:
+            for event in events:
+                effects += event()
             effects += self._core.tick(self._clock())
             if self._changed_at_s is None and self._core.changed:
                 self._changed_at_s = self._clock()
@@ -151,12 +166,20 @@ class FusionService:
                 )
 
     def _solve_for_ever(self) -> None:
+        """Serve a map when there is news: something folded, or a vehicle that fell silent or came back."""
         while not self._over.wait(self._settings.map_s):
-            if self._core.changed:
-                self._serve(final=False)
+            try:
+                with self._lock:
+                    stalled = [state.stalled for state in self._core.states(self._clock())]
+                if self._core.changed or stalled != [state.stalled for state in self.newest.vehicles]:
+                    self._serve(final=False)
+            except NumericalError as error:
+                log.error("map_not_solved reason=%s", error)
+            except Exception:  # a fault of ours must not end the service of maps: the next one may be fine
+                log.exception("map_not_served")
 
     def _serve(self, *, final: bool) -> None:
-        """Solve and publish the newest map; one that cannot be solved leaves the last one served."""
+        """Solve and publish the newest map. Raises NumericalError, the last one served, where it cannot be solved."""
         with self._lock:
             taken = map_input(self._core, self._clock())
             self._core.changed = False
@@ -164,18 +187,20 @@ class FusionService:
         begin = time.perf_counter()
         try:
             newest = make_map(taken, self.newest.version + 1, self._settings, final=final)
-        except NumericalError as error:
-            log.error("map_not_solved reason=%s", error)
-            return
+        except NumericalError:
+            self._changed_at_s = changed_at_s
+            raise
         self.statistics.solve_s.append(time.perf_counter() - begin)
         self.newest = newest
-        data = encode_map(newest)
-        self._served = data
-        for piece in map_pieces(data, newest.version):
-            self._bus.put(self._keys.map(), piece)
+        self._served = encode_map(newest)
+        self._publish()
         self.statistics.maps += 1
         if changed_at_s is not None:
             self.statistics.behind_s.append(self._clock() - changed_at_s)
+
+    def _publish(self) -> None:
+        for piece in map_pieces(self._served, self.newest.version):
+            self._maps.put(self._keys.map(), piece)
 
     def behind_p99_s(self) -> float | None:
         """99th percentile of how far served maps were behind, s."""

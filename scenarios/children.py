@@ -97,14 +97,23 @@ def run_fusion(
     """Host a router and fuse until every expected vehicle has ended (0: until told to stop)."""
     warm_up(lambda text: say({"event": "note", "text": text}))
     with (
-        open_bus(listen=listen, config=config, insecure=insecure) as session,
+        open_bus(listen=listen, config=config, insecure=insecure, mode="router") as session,
         _with_link(session, link, [seed, 1]) as bus,
     ):
         core = FusionCore(fleet, "fusion", settings, expected)
-        service = FusionService(bus, core, fleet, settings)
+        version = time.time_ns() // 1_000_000  # so that the maps of a node started again count as newer
+        service = FusionService(bus, core, fleet, settings, maps=session, first_version=version)
         say({"event": "listening", "endpoint": session.endpoints()[0]})
 
+        silent: set[str] = set()
+
         def tell(core: FusionCore) -> None:
+            nonlocal silent
+            now_silent = {state.name for state in core.states(time.monotonic()) if state.stalled}
+            if now_silent - silent:
+                text = f"no word from {', '.join(sorted(now_silent))} for {settings.stalled_s:.0f} s"
+                say({"event": "note", "text": text})
+            silent = now_silent
             streams = core.ledger.streams.values()
             done, total = sum(s.ended for s in streams), max(expected, len(streams))
             say({"event": "progress", "done": done, "total": total, "messages": sum(s.next for s in streams)})

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from fleet_seif.errors import NumericalError, RunError
+from fleet_seif.messages import check_name
 from fleet_seif.warm_up import warm_up
 from scenarios import children, output, watch
 from scenarios.config import ScenarioError, load_scenario, shipped
@@ -22,15 +23,28 @@ from scenarios.source import record
 from scenarios.table import report_table
 from scenarios.virtual import run_virtual
 
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
 console = Console()
 errors = Console(stderr=True)
+
+
+def _fleet_name(name: str | None) -> str | None:
+    """The name, if it can be part of a key."""
+    try:
+        return name if name is None else check_name(name, "fleet")
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+
 
 ScenarioArgument = Annotated[str, typer.Argument(help="A shipped scenario (see 'scenarios') or a TOML file.")]
 SeedOption = Annotated[int | None, typer.Option(min=0, help="Seed of world, noise and link.")]
 SetOption = Annotated[list[str] | None, typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Change a setting.")]
 ConfigOption = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="A Zenoh configuration file.")]
 InsecureOption = Annotated[bool, typer.Option("--insecure", help="Allow unencrypted endpoints beyond loopback.")]
+FleetOption = Annotated[
+    str | None, typer.Option(help="Name of the fleet; the scenario's by default.", callback=_fleet_name)
+]
 SupervisedOption = Annotated[bool, typer.Option("--supervised", hidden=True)]
 ResultOption = Annotated[Path | None, typer.Option(hidden=True)]
 
@@ -45,7 +59,7 @@ def _clear_errors() -> Iterator[None]:
     except (RunError, NumericalError) as error:
         _fail(str(error), 1)
     except KeyboardInterrupt:
-        _fail("interrupted: all processes have been ended", 130)
+        _fail("interrupted", 130)
 
 
 def _fail(text: str, code: int) -> None:
@@ -100,7 +114,7 @@ def run(
 @_clear_errors()
 def fusion(
     listen: Annotated[list[str] | None, typer.Option(help="Where to listen, e.g. tcp/127.0.0.1:7447.")] = None,
-    fleet: Annotated[str | None, typer.Option(help="Name of the fleet; the scenario's by default.")] = None,
+    fleet: FleetOption = None,
     expected: Annotated[int, typer.Option(min=0, help="End after so many vehicles have ended; 0: go on.")] = 0,
     scenario: Annotated[str | None, typer.Option(help="Take [fusion] and [link] settings from a scenario.")] = None,
     seed: SeedOption = None,
@@ -117,7 +131,7 @@ def fusion(
         settings=chosen.fusion,
         link=chosen.link,
         seed=chosen.run.seed,
-        listen=listen or ["tcp/127.0.0.1:7447"],
+        listen=_endpoints(listen, config),
         config=config,
         insecure=insecure,
         expected=expected,
@@ -132,7 +146,7 @@ def vehicle(
     scenario: ScenarioArgument,
     name: Annotated[str, typer.Option(help="Which of the scenario's vehicles.")],
     connect: Annotated[list[str] | None, typer.Option(help="The fusion node, e.g. tcp/127.0.0.1:7447.")] = None,
-    fleet: Annotated[str | None, typer.Option(help="Name of the fleet; the scenario's by default.")] = None,
+    fleet: FleetOption = None,
     seed: SeedOption = None,
     settings: SetOption = None,
     config: ConfigOption = None,
@@ -146,7 +160,7 @@ def vehicle(
     children.run_vehicle(
         load_scenario(scenario, tuple(overrides), seed),
         name=name,
-        connect=connect or ["tcp/127.0.0.1:7447"],
+        connect=_endpoints(connect, config),
         config=config,
         insecure=insecure,
         result=result,
@@ -158,14 +172,20 @@ def vehicle(
 @app.command("watch")
 @_clear_errors()
 def watch_map(
-    endpoint: Annotated[str, typer.Argument(help="A fusion node.")] = "tcp/127.0.0.1:7447",
-    fleet: Annotated[str, typer.Option(help="Name of the fleet.")] = "fleet",
+    endpoint: Annotated[str | None, typer.Argument(help="A fusion node, tcp/127.0.0.1:7447 by default.")] = None,
+    fleet: Annotated[str, typer.Option(help="Name of the fleet.", callback=_fleet_name)] = "fleet",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a map.")] = False,
     config: ConfigOption = None,
     insecure: InsecureOption = False,
 ) -> None:
     """Show the joint map of a fleet as it grows."""
-    asyncio.run(watch.watch(endpoint, fleet, as_json, config, insecure, console))
+    endpoints = _endpoints([endpoint] if endpoint else None, config)
+    asyncio.run(watch.watch(endpoints, fleet, as_json, config, insecure, console))
+
+
+def _endpoints(given: list[str] | None, config: Path | None) -> list[str]:
+    """What was asked for; the default only where no configuration file says it."""
+    return given or ([] if config else [DEFAULT_ENDPOINT])
 
 
 def _as_child(supervised: bool) -> tuple[children.Say, Callable[[], None]]:

@@ -78,7 +78,11 @@ def load_scenario(name: str, overrides: tuple[str, ...] = (), seed: int | None =
     if name in shipped():
         source, text = f"scenario {name}", (resources.files("scenarios") / f"{name}.toml").read_text()
     elif path.suffix == ".toml" and path.is_file():
-        source, text = str(path), path.read_text()
+        source = str(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ScenarioError(f"{source}: cannot be read as UTF-8 text: {error}") from None
     else:
         raise ScenarioError(f"no scenario {name!r}: use one of {', '.join(shipped())}, or the path of a .toml file")
     try:

@@ -141,6 +141,8 @@ def run_processes(
                 for vehicle in recording.logs:
                     connect = ["--name", vehicle, "--connect", event["endpoint"]]
                     children.start(vehicle, ["vehicle", *arguments, *connect, *common])
+            elif event["event"] == "note":
+                say(f"{child}: {event['text']}")
             elif event["event"] == "ready":
                 ready.add(child)
                 if ready == set(recording.logs):

@@ -17,13 +17,21 @@ from vehicles.drive import DriveResult
 
 FORMAT: Final = 1
 PARKED_MAX: Final = 1
+PARTS: Final = {
+    "": ("report.json", "map.npz", "map.json", "truth.npz", "figure.png"),
+    "readings": ("*.npz",),
+    "trajectory": ("*.tum",),
+    "process": ("*.npz", "fusion.json", "ledger.bin"),
+}
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make the folder and its parts. Raises RunError where that cannot be."""
+    """Make the folder and its parts, without what an earlier run left there. Raises RunError where that cannot be."""
     try:
-        for part in ("readings", "trajectory", "process"):
+        for part, kinds in PARTS.items():
             (folder / part).mkdir(parents=True, exist_ok=True)
+            for old in (path for kind in kinds for path in (folder / part).glob(kind)):
+                old.unlink()
     except OSError as error:
         raise RunError(f"cannot write to {folder}: {error.strerror or error}; give another --out DIR") from None
 
@@ -106,7 +114,7 @@ def write_json(path: Path, value: Mapping[str, object]) -> None:
 
 
 def stream_facts(core: FusionCore, now_s: float) -> dict[str, dict[str, int]]:
-    """Per vehicle what a report says of its messages."""
+    """Per vehicle what a report says of its messages; of several epochs, the one that is placed."""
     return {
         state.name: {
             "deltas_folded": state.cut + 1,
@@ -115,7 +123,7 @@ def stream_facts(core: FusionCore, now_s: float) -> dict[str, dict[str, int]]:
             "parked": state.parked,
             "messages_refused": state.refused,
         }
-        for state in core.states(now_s)
+        for state in sorted(core.states(now_s), key=lambda state: state.placed)
     }
 
 

@@ -96,7 +96,6 @@ def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
     output.write_truth(folder, run.recording)
     output.write_map(folder, outcome.solution, outcome.landmark_cov, outcome.score.landmark_truth)
     output.write_ledger(folder / "process" / "ledger.bin", run.ledger)
-    output.write_json(folder / "report.json", outcome.report)
     times = figure_times(run.scenario.figure, run.recording)
     draw_figure(
         folder / "figure.png",
@@ -106,6 +105,7 @@ def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
         moments=list(replay(run.ledger, times.times_s)),
         tracks={name: drive.pose for name, drive in run.drives.items()},
     )
+    output.write_json(folder / "report.json", outcome.report)  # last: who finds it finds the rest
 
 
 def meeting_report(ledger: Ledger, recording: Recording) -> list[dict[str, Any]]:

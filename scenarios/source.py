@@ -26,7 +26,10 @@ def record(scenario: Scenario, only: str | None = None) -> Recording:
             raise ScenarioError(str(error)) from None
     assert scenario.world is not None
     names = vehicle_names(scenario)
-    recording = simulate(scenario.world, scenario.noise, names, scenario.run.seed)
+    try:
+        recording = simulate(scenario.world, scenario.noise, names, scenario.run.seed)
+    except ValueError as error:  # settings that are fine each, but not together
+        raise ScenarioError(f"[world] {error}") from None
     if only is None:
         return recording
     if only not in recording.logs:

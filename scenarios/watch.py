@@ -18,10 +18,10 @@ GRID_COLUMNS = 72
 
 
 async def watch(
-    endpoint: str, fleet: str, as_json: bool, config: Path | None, insecure: bool, console: Console
+    endpoints: list[str], fleet: str, as_json: bool, config: Path | None, insecure: bool, console: Console
 ) -> None:
     """Show every map until the run ends, or until interrupted."""
-    async with connect(endpoint, fleet=fleet, config=config, insecure=insecure) as client:
+    async with connect(endpoints, fleet=fleet, config=config, insecure=insecure) as client:
         if as_json:
             async for joint in client.maps():
                 print(json.dumps(as_dict(joint)), flush=True)  # noqa: T201

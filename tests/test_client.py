@@ -102,3 +102,20 @@ async def test_nobody_there_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(RunError, match="cannot reach a fusion node"):
         async with fleet_seif.connect("tcp/127.0.0.1:1", fleet="demo"):
             pass
+
+
+async def test_every_iterator_gets_the_current_map(network: Network) -> None:
+    current = encode_map(joint_map(5))
+    network.bus.answer(Keys("demo").map(), lambda key, data: [current])
+    async with fleet_seif.connect(network.endpoint, fleet="demo") as fleet, asyncio.timeout(20):
+        for _ in range(2):
+            async for joint in fleet.maps():
+                assert joint.version == 5
+                break
+
+
+def test_forged_pieces_of_far_versions_do_not_push_real_ones_out() -> None:
+    assembler = MapAssembler()
+    for k in range(8):
+        assembler.take(map_pieces(encode_map(joint_map(1, LARGE)), 2**52 + k)[0])
+    assert [j.version for piece in pieces(6) if (j := assembler.take(piece)) is not None] == [6]

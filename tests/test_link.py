@@ -1,6 +1,7 @@
 """A bad link on purpose: what it may do to messages, and what it may not."""
 
 import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -135,6 +136,9 @@ def through(settings: LinkSettings, expected: int) -> list[tuple[str, bytes]]:
     bus = FaultyBus(recorder, settings, seed=3)
     for key, payload in PUTS:
         bus.put(key, payload)
+    recorder.wait_for(expected)
+    while bus._due:  # what should have been lost would still be here
+        time.sleep(0.001)
     got = recorder.wait_for(expected)
     bus.close()
     return got

@@ -182,6 +182,7 @@ def test_unsent_messages_above_the_limit_are_coalesced_and_an_ended_stream_still
         machine.append(one, 0)
         if k == WINDOW:
             machine.release()
+    machine.outbox._next_pair = len(machine.outbox._unsent) - 1  # the turn has come to the newest pair
     machine.end()
     while machine.outbox.last_put < machine.outbox.last:
         machine.release()

@@ -1,11 +1,13 @@
 """The last mile: real processes, real Zenoh, the commands a user types."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from tests.fleets import run_virtual
 
 COMMAND = [sys.executable, "-m", "scenarios"]
 FAST = ["--set", "world.steps=120"]
-PATIENCE_S = 60
+PATIENCE_S = 100
 
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -41,6 +43,10 @@ def running(pid: int) -> bool:
         return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def command_line(pid: int) -> bytes:
+    return (Path("/proc") / str(pid) / "cmdline").read_bytes()
 
 
 def wait_until(condition: object, what: str) -> None:
@@ -178,7 +184,9 @@ def test_a_vehicle_that_dies_ends_the_run_with_its_name() -> None:
     try:
         wait_until(lambda: len(children_of(run.pid)) == 3, "three processes")
         victim = next(
-            pid for pid in children_of(run.pid) if b"v2" in (Path("/proc") / str(pid) / "cmdline").read_bytes()
+            pid
+            for pid in children_of(run.pid)
+            if b"--name\0v2\0" in (Path("/proc") / str(pid) / "cmdline").read_bytes()
         )
         others = [pid for pid in children_of(run.pid) if pid != victim]
         os.kill(victim, signal.SIGKILL)
@@ -190,33 +198,70 @@ def test_a_vehicle_that_dies_ends_the_run_with_its_name() -> None:
     assert not any(running(pid) for pid in others)
 
 
-def test_a_subscriber_sees_the_map_grow_to_the_final_one() -> None:
-    fusion = subprocess.Popen(
-        [*COMMAND, "fusion", "--listen", "tcp/127.0.0.1:0", "--fleet", "demo", "--expected", "1", "--supervised"],
+@contextlib.contextmanager
+def fusion_node(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A fusion node of fleet "demo" on its own, and where it listens."""
+    node = subprocess.Popen(
+        [*COMMAND, "fusion", "--listen", "tcp/127.0.0.1:0", "--fleet", "demo", "--supervised", *arguments],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    assert fusion.stdout is not None
-    assert fusion.stdin is not None
+    assert node.stdout is not None
+    assert node.stdin is not None
     try:
-        endpoint = next(e["endpoint"] for line in fusion.stdout if (e := json.loads(line))["event"] == "listening")
-        watcher = subprocess.Popen(
-            [*COMMAND, "watch", endpoint, "--fleet", "demo", "--json"], stdout=subprocess.PIPE, text=True
-        )
-        driven = command(
-            "vehicle", "fleet", "--name", "v1", "--connect", endpoint, "--fleet", "demo", "--set", "world.steps=60",
-            "--set", "run.rate_hz=100",
-        )  # fmt: skip
-        assert driven.returncode == 0, driven.stderr
-        lines, _ = watcher.communicate(timeout=PATIENCE_S)
-        assert fusion.wait(PATIENCE_S) == 0
+        yield node, next(e["endpoint"] for line in node.stdout if (e := json.loads(line))["event"] == "listening")
     finally:
-        fusion.stdin.close()
-        fusion.stdout.close()
-        fusion.kill()
-    maps = [json.loads(line) for line in lines.splitlines()]
+        node.stdin.close()
+        node.stdout.close()
+        node.kill()
+        node.wait()
+
+
+@contextlib.contextmanager
+def json_watcher(endpoint: str) -> Iterator[subprocess.Popen[str]]:
+    """A subscriber that prints JSON lines."""
+    watcher = subprocess.Popen(
+        [*COMMAND, "watch", endpoint, "--fleet", "demo", "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        yield watcher
+    finally:
+        watcher.kill()
+        watcher.communicate()
+
+
+def drive_v1(endpoint: str, steps: int) -> None:
+    settings = ("--set", f"world.steps={steps}", "--set", "run.rate_hz=100")
+    done = command("vehicle", "fleet", "--name", "v1", "--connect", endpoint, "--fleet", "demo", *settings)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_subscriber_sees_the_map_grow_to_the_final_one() -> None:
+    with fusion_node("--expected", "2") as (node, endpoint):
+        drive_v1(endpoint, 60)
+        with json_watcher(endpoint) as watcher:
+            assert watcher.stdout is not None
+            maps = [json.loads(watcher.stdout.readline())]  # a map at once, though nothing happens any more
+            settings = ("--set", "fleet.vehicles=2", "--set", "world.steps=60", "--set", "run.rate_hz=100")
+            done = command("vehicle", "fleet", "--name", "v2", "--connect", endpoint, "--fleet", "demo", *settings)
+            assert done.returncode == 0, done.stderr
+            maps += [json.loads(line) for line in watcher.communicate(timeout=PATIENCE_S)[0].splitlines()]
+        assert node.wait(PATIENCE_S) == 0
+    assert not maps[0]["final"]
     assert maps[-1]["final"]
     assert [m["version"] for m in maps] == sorted({m["version"] for m in maps})
-    assert [(v["name"], v["cut"], v["placed"]) for v in maps[-1]["vehicles"]] == [("v1", 61, True)]
+    assert [(v["name"], v["cut"], v["placed"]) for v in maps[-1]["vehicles"]] == [("v1", 61, True), ("v2", 61, True)]
+
+
+def test_a_subscriber_is_told_when_the_fusion_node_is_gone() -> None:
+    with fusion_node() as (node, endpoint), json_watcher(endpoint) as watcher:
+        drive_v1(endpoint, 20)
+        assert watcher.stdout is not None
+        watcher.stdout.readline()
+        node.kill()
+        _, errors = watcher.communicate(timeout=PATIENCE_S)
+    assert watcher.returncode == 1
+    assert "fusion node has been away" in errors
 
 
 @pytest.mark.parametrize(
@@ -233,6 +278,9 @@ def test_a_subscriber_sees_the_map_grow_to_the_final_one() -> None:
         (["vehicle", "fleet", "--name", "v1", "--connect", "tcp/192.0.2.1:7447"], 1, ["--insecure"]),
         (["fusion", "--listen", "tcp/0.0.0.0:0"], 1, ["--insecure"]),
         (["fusion", "--listen", "nonsense"], 1, ["PROTOCOL/ADDRESS"]),
+        (["run", "three_air_vehicles", "--set", "world.steps=60"], 2, ["60 steps", "at least 89"]),
+        (["fusion", "--fleet", "a/b"], 2, ["a/b", "characters"]),
+        (["watch", "--fleet", "a b"], 2, ["a b", "characters"]),
         (["fly"], 2, ["fly"]),
     ],
 )

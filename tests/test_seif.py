@@ -329,7 +329,7 @@ def test_a_refused_reading_leaves_every_bit_of_the_filter_as_it_was(bend: Callab
 def test_a_number_beyond_the_quanta_is_refused_and_leaves_the_filter_as_it_was() -> None:
     seif, _ = run(SPARSE, drive(square(12, 4.0, 1), steps=20, seed=2))
     before = state_of(seif)
-    with pytest.raises(NumericalError, match="quanta"):
+    with pytest.raises(ReadingRefused, match="quanta"):
         seif.step(reading(9.0, sighting((1.0, 0.0), 5, std=(1e-6, 1e-6))))
     assert state_of(seif) == before
 

@@ -4,12 +4,14 @@ import threading
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from fleet_seif.bus import open_bus
 from fleet_seif.config import FusionSettings, PublishSettings
 from fleet_seif.errors import ReadingRefused
 from fleet_seif.records import Sightings
 from fusion.core import FusionCore
+from fusion.ledger import Ledger, Receipt
 from fusion.service import FusionService
 from tests.conftest import Network
 from vehicles import Vehicle
@@ -99,3 +101,44 @@ def test_a_connected_vehicle_is_fused_and_acknowledged(network: Network) -> None
     assert final.final
     assert final.landmark_mean[0] == pytest.approx([3.0, 1.0], abs=1e-3)
     assert final.pose_mean[0] == pytest.approx(vehicle.pose, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pose", "cov"),
+    [
+        ((np.nan, 0, 0), None),
+        ((0, 0), None),
+        ((0, 0, 0), np.ones((3, 3))),
+        ((0, 0, 0), [[25, 15, 0], [15, 9, 0], [0, 0, 1]]),
+        ((0, 0, 0), np.eye(2)),
+    ],
+)
+def test_start_poses_that_no_node_could_use_are_refused(pose: tuple[float, ...], cov: ArrayLike | None) -> None:
+    with pytest.raises(ValueError, match="start_pose"):
+        Vehicle("mine", start_pose=pose, start_pose_cov=cov)
+
+
+def test_whatever_numbers_a_vehicle_takes_a_node_can_read() -> None:
+    vehicle = Vehicle("mine", start_pose=(1, 2, 0), start_pose_cov=np.diag([1, 2, 3]) * 1e-3)
+    seen = Sightings(z=np.array([[2, 0]]), cov=np.array([np.eye(2)]), signature=np.array([3], np.int32))
+    vehicle.start(seen, time_s=0)
+    for time_s in (1, np.int64(2), np.float32(3.5)):
+        vehicle.step([1, 0, 0], np.eye(3), seen, time_s=time_s)  # type: ignore[arg-type]
+    ledger = Ledger("fleet", 4)
+    for data in vehicle._core.release():
+        assert ledger.accept(data)[0] is Receipt.FOLDED
+
+
+def test_signatures_that_are_not_integers_are_refused() -> None:
+    seen = Sightings(z=np.array([[2.0, 0]]), cov=np.array([np.eye(2)]), signature=np.array([3.0]))
+    with pytest.raises(ReadingRefused, match="integers"):
+        Vehicle("mine").start(seen, time_s=0.0)
+
+
+def test_a_sighting_too_sharp_for_the_fixed_point_is_refused_and_the_vehicle_stays_healthy() -> None:
+    vehicle = Vehicle("mine")
+    sharp = Sightings(z=np.array([[2.0, 0]]), cov=np.array([1e-11 * np.eye(2)]), signature=np.array([3]))
+    with pytest.raises(ReadingRefused, match="quanta"):
+        vehicle.step((0.1, 0, 0), COV, sharp)
+    vehicle.step((0.1, 0, 0), COV, sighting())
+    assert vehicle._core.healthy

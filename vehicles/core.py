@@ -20,7 +20,7 @@ from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hel
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
 from fleet_seif.seif import Seif, StepResult
-from fleet_seif.wire import decode_ack, decode_range, encode_heartbeat
+from fleet_seif.wire import decode_ack, decode_range, encode_heartbeat, is_start_covariance
 from vehicles.outbox import Outbox
 
 SIGHTINGS_MAX = 1024
@@ -50,6 +50,16 @@ class Counters:
     bytes_put: int = 0
 
 
+def _check_start(identity: Identity) -> None:
+    pose, cov = identity.start_pose, identity.start_pose_cov
+    if pose.shape != (3,) or not np.all(np.isfinite(pose)):
+        raise ValueError(f"start_pose {pose.tolist()}: expected three finite numbers, x m, y m, theta rad")
+    if cov.shape != (3, 3) or not (np.array_equal(cov, np.zeros((3, 3))) or is_start_covariance(cov)):
+        raise ValueError(
+            f"start_pose_cov {cov.tolist()}: expected zeros (given) or a symmetric positive definite (3, 3) matrix"
+        )
+
+
 class VehicleCore:
     """See the rules above."""
 
@@ -58,6 +68,7 @@ class VehicleCore:
     ) -> None:
         check_name(identity.fleet, "fleet")
         check_name(identity.vehicle, "vehicle")
+        _check_start(identity)
         self.identity = identity
         self.filter = Seif(settings, model)
         self.outbox = Outbox(publish)

@@ -92,8 +92,11 @@ def drive(
         notes.publish_s.append(vehicle.publish_s)
         on_step(step)
     vehicle.end()
-    if not vehicle.wait_until_acknowledged(SILENCE_S):
-        raise _silence()
+    acknowledged = vehicle.acknowledged
+    while not vehicle.wait_until_acknowledged(SILENCE_S):
+        if vehicle.acknowledged == acknowledged:
+            raise _silence()
+        acknowledged = vehicle.acknowledged
     counters = vehicle.counters
     return notes.result(
         vehicle.landmarks, vehicle.signatures, counters.bytes_put, counters.messages,

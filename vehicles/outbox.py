@@ -2,7 +2,7 @@
 
 1. Messages are put in order; at most `window` past the last acknowledgement.
 2. A message is fixed for ever once its bytes were put; before that it may be coalesced with its neighbour.
-3. Above `outbox_max` messages the unsent ones are coalesced in pairs: nothing is lost, the stream gets coarser.
+3. Above `outbox_max` messages a pair of unsent ones becomes one: nothing is lost, the stream gets coarser.
 4. What has been acknowledged is forgotten; a snapshot is all that the filter has published less what is still here.
 """
 
@@ -42,6 +42,7 @@ class Outbox:
         self._settings = settings
         self._sent: deque[_Sent] = deque()
         self._unsent: deque[DeltaMessage] = deque()
+        self._next_pair = 0
         self._hello: Hello | None = None
         self._acknowledged: _Sent | None = None
         self._innovation, self._innovation_dof, self._refused = 0.0, 0, 0
@@ -61,13 +62,14 @@ class Outbox:
             self._coalesce()
 
     def _coalesce(self) -> None:
-        messages, self._unsent = list(self._unsent), deque()
-        for i in range(0, len(messages) - 1, 2):
-            pair = Coalescer(messages[i])
-            pair.add(messages[i + 1])
-            self._unsent.append(pair.message())
-        if len(messages) % 2:
-            self._unsent.append(messages[-1])
+        """Make one message of the next pair; the pairs are taken in turn, so that all get coarser alike."""
+        if self._next_pair + 1 >= len(self._unsent):
+            self._next_pair = 0
+        pair = Coalescer(self._unsent[self._next_pair])
+        pair.add(self._unsent[self._next_pair + 1])
+        self._unsent[self._next_pair] = pair.message()
+        del self._unsent[self._next_pair + 1]
+        self._next_pair += 1
 
     @property
     def full(self) -> bool:
@@ -78,8 +80,9 @@ class Outbox:
         """Bytes of the messages to put now."""
         released = []
         while self._unsent and not self.full:
-            message = self._unsent.popleft()
+            message = self._unsent[0]
             data = encode_message(message)
+            self._unsent.popleft()
             self.prefix_digest = extend_prefix(self.prefix_digest, body_digest(data))
             self.last_put = message.last
             self._sent.append(_Sent(message, data, self.prefix_digest))

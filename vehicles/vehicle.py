@@ -28,6 +28,12 @@ TICK_S = 0.05
 ACKS_MAX = 10_000
 
 
+def symmetric(matrix: ArrayLike) -> Floats:
+    """The symmetric part of a matrix, as a new array: rounding leaves covariances a little off."""
+    A = np.array(matrix, float)
+    return (A + A.T) / 2 if A.ndim == 2 else A
+
+
 class Vehicle:
     """One vehicle: `step` it with odometry and sightings, read `pose` and `landmarks`.
 
@@ -58,7 +64,7 @@ class Vehicle:
             vehicle=name,
             epoch=epoch or Epoch(time.time_ns() // 1_000_000, secrets.randbits(64)),
             start_pose=np.asarray(start_pose, float),
-            start_pose_cov=np.zeros((3, 3)) if start_pose_cov is None else np.asarray(start_pose_cov, float),
+            start_pose_cov=np.zeros((3, 3)) if start_pose_cov is None else symmetric(start_pose_cov),
         )
         self._core = VehicleCore(identity, settings or FilterSettings(), publish or PublishSettings(), model)
         self._clock = clock
@@ -156,7 +162,7 @@ class Vehicle:
             return result
 
     def _time(self, time_s: float | None) -> float:
-        return self._clock() if time_s is None else time_s
+        return self._clock() if time_s is None else float(time_s)
 
     def end(self) -> None:
         """End the stream; the map stays."""
@@ -191,6 +197,12 @@ class Vehicle:
         """The signature of each landmark, in the same order."""
         with self._lock:
             return list(self._core.filter.signatures)
+
+    @property
+    def acknowledged(self) -> int:
+        """Sequence number of the last message that a fusion node holds, -1 for none."""
+        with self._lock:
+            return self._core.outbox.last_acknowledged
 
     @property
     def counters(self) -> Counters:
