@@ -89,13 +89,3 @@ def act_inverse(T_ab: Floats, p_a: Floats) -> Floats:
     c, s = math.cos(T_ab[2]), math.sin(T_ab[2])
     dx, dy = p_a[0] - T_ab[0], p_a[1] - T_ab[1]
     return np.array([c * dx + s * dy, -s * dx + c * dy])
-
-
-@kernel
-def act_inverse_jacobians(T_ab: Floats, p_a: Floats) -> tuple[Floats, Floats]:
-    """J_pb_T (2, 3) and J_pb_pa (2, 2) of `act_inverse`."""
-    c, s = math.cos(T_ab[2]), math.sin(T_ab[2])
-    dx, dy = p_a[0] - T_ab[0], p_a[1] - T_ab[1]
-    J_pb_T = np.array([[-c, -s, -s * dx + c * dy], [s, -c, -c * dx - s * dy]])
-    J_pb_pa = np.array([[c, s], [-s, c]])
-    return J_pb_T, J_pb_pa

@@ -239,20 +239,6 @@ class FrameTotal:
             b=full_b,
         )
 
-    def copy(self) -> "FrameTotal":
-        twin = FrameTotal()
-        twin._keys, twin._offsets = self._keys.copy(), self._offsets.copy()
-        twin._values, twin._used = self._values.copy(), self._used.copy()
-        return twin
-
-
-def sum_deltas(deltas: list[FrameDelta]) -> FrameDelta:
-    """One delta with the effect of all."""
-    total = FrameTotal()
-    for delta in deltas:
-        total.add(delta)
-    return total.delta()
-
 
 def to_information(delta: FrameDelta) -> FrameInformation:
     """A cumulative delta as floating-point H and b."""

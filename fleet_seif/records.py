@@ -1,15 +1,12 @@
 """The frozen records that cross boundaries between the parts of the system."""
 
 from dataclasses import dataclass
-from typing import NewType
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-VehicleName = NewType("VehicleName", str)
 
 UNKNOWN_SIGNATURE = -1
 

@@ -70,14 +70,13 @@ class Children:
 
         Raises RunError when one ends with an error.
         """
-        running = set(self._processes)
-        while running:
+        ended: set[str] = set()
+        while ended != set(self._processes):  # a consumer may start more meanwhile
             name, event = self._said.get()
             if event is not None:
                 yield name, event
-                running |= set(self._processes) - running if event.get("event") == "listening" else set()
                 continue
-            running.discard(name)
+            ended.add(name)
             if self._processes[name].returncode != 0:
                 words = "".join(self._errors[name]).strip() or "(it said nothing)"
                 raise RunError(f"process {name} ended with code {self._processes[name].returncode}:\n{words}")

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 
 from fleet_seif.config import FilterSettings, PublishSettings
+from fleet_seif.information import FrameDelta, FrameTotal
 from fleet_seif.messages import Epoch
 from fleet_seif.models import COMPASS_XY, RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
@@ -119,3 +120,11 @@ def streams(steps: int = 12) -> dict[str, tuple[bytes, ...]]:
         core.end()
         published[vehicle] = tuple(core.release())
     return published
+
+
+def sum_deltas(deltas: list[FrameDelta]) -> FrameDelta:
+    """One delta with the effect of all."""
+    total = FrameTotal()
+    for delta in deltas:
+        total.add(delta)
+    return total.delta()

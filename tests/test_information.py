@@ -12,10 +12,10 @@ from fleet_seif.information import (
     FrameTotal,
     delta_digest,
     row_offsets,
-    sum_deltas,
     to_information,
 )
 from tests import reference
+from tests.drives import sum_deltas
 from tests.strategies import deltas, settled
 
 SOME = st.lists(deltas(bound=2**56), max_size=6)
@@ -95,17 +95,6 @@ def test_a_total_is_a_delta_that_adds_up_to_itself(parts: list[FrameDelta]) -> N
     assert np.all(np.diff(whole.variables) > 0)
     assert np.all(whole.rows <= whole.cols)
     assert np.all(np.diff(whole.rows * len(whole.variables) + whole.cols) > 0)
-
-
-@given(NEAR, deltas(variable_max=6, bound=2**56))
-@settled
-def test_a_copy_goes_its_own_way(parts: list[FrameDelta], more: FrameDelta) -> None:
-    total = total_of(parts)
-    before, twin = total.delta(), total.copy()
-    assert same(twin.delta(), before)
-    twin.add(more)
-    assert same(total.delta(), before)
-    assert same(twin.delta(), total_of([*parts, more]).delta())
 
 
 @given(NEAR, st.sampled_from(["H", "b"]), st.sampled_from([1, -1]), st.integers(0, 3))

@@ -23,14 +23,13 @@ from fleet_seif.information import (
     FrameDelta,
     FrameTotal,
     delta_digest,
-    sum_deltas,
     to_information,
 )
 from fleet_seif.models import COMPASS_XY, RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
 from fleet_seif.seif import Seif
 from tests import reference
-from tests.drives import Drive, drive, landmark_of, reading, sighting, square
+from tests.drives import Drive, drive, landmark_of, reading, sighting, square, sum_deltas
 
 DENSE = FilterSettings(active_max=1000, gate=1e300)
 SPARSE = FilterSettings(active_max=6)
