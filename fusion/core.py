@@ -105,6 +105,9 @@ class FusionCore:
         link = self._link(stream)
         link.heard_s = now_s
         link.announced = max(link.announced, heartbeat.last)
+        if heartbeat.last == stream.next - 1 and heartbeat.prefix_digest != stream.prefix_digest:
+            self.counters["forks"] += 1
+            log.error("stream_forked vehicle=%s last=%d: it says that it sent something else", vehicle, heartbeat.last)
         if stream.next > 0:
             link.ack_due_s = now_s  # an acknowledgement may have been lost: repeat it
         return self._acknowledge(stream, link, now_s) + self._repair(stream, link, now_s)

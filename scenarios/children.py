@@ -116,7 +116,7 @@ def run_fusion(
             silent = now_silent
             streams = core.ledger.streams.values()
             done, total = sum(s.ended for s in streams), max(expected, len(streams))
-            say({"event": "progress", "done": done, "total": total, "messages": sum(s.next for s in streams)})
+            say({"event": "progress", "done": done, "total": total})
 
         service.run(tell)
         if result is not None:

@@ -102,6 +102,22 @@ def test_a_heartbeat_reveals_that_the_last_messages_were_lost(fusion: FusionCore
     assert [decode_range(e.data).first for e in fusion.tick(0.7) if isinstance(e, AskRange)] == [1]
 
 
+def test_a_heartbeat_shows_when_a_stream_is_not_what_its_vehicle_sent(fusion: FusionCore) -> None:
+    core, other = vehicle(), vehicle()
+    for data in messages(core, 3):
+        fusion.on_delta("v1", data, 0.0)
+    other.start(0.0, Sightings.none())
+    for k in range(1, 4):
+        other.step(Reading(time_s=float(k), odometry=np.zeros(3), odometry_cov=np.eye(3), sightings=Sightings.none()))
+    other.end()
+    other.release()
+    for each, forks in ((core, 0), (other, 1)):
+        heartbeat = each.tick(9.0)
+        assert heartbeat is not None
+        fusion.on_heartbeat("v1", heartbeat, 9.0)
+        assert fusion.counters["forks"] == forks
+
+
 def test_a_heartbeat_repeats_an_acknowledgement_that_was_lost(fusion: FusionCore) -> None:
     core = vehicle()
     for data in messages(core, 3):
