@@ -7,7 +7,6 @@ for again by whoever finds it missing. Handlers run on Zenoh's threads and must 
 import contextlib
 import ipaddress
 import json
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -15,8 +14,6 @@ from typing import Any, Literal, Protocol
 import zenoh
 
 from fleet_seif.errors import RunError
-
-log = logging.getLogger(__name__)
 
 OnPut = Callable[[str, bytes], None]
 OnQuery = Callable[[str, bytes], list[bytes]]

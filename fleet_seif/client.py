@@ -66,8 +66,7 @@ class FleetClient:
         self._newest: JointMap | None = None
         self._nodes: set[str] = set()
         self._gone_at_s: float | None = None
-        self._changed = asyncio.Condition()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._changed = asyncio.Event()
         keys = Keys(fleet)
         bus.subscribe(keys.map(), lambda _, data: self._hand_over(self._take, data, False))
         bus.watch(keys.node("*"), lambda key, alive: self._hand_over(self._note_node, key, alive))
@@ -93,13 +92,9 @@ class FleetClient:
         self._wake()
 
     def _wake(self) -> None:
-        async def notify() -> None:
-            async with self._changed:
-                self._changed.notify_all()
-
-        task = self._loop.create_task(notify())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        """Wake everybody who waits now; who waits later waits for the next change."""
+        self._changed.set()
+        self._changed = asyncio.Event()
 
     async def maps(self) -> AsyncIterator[JointMap]:
         """The current map, then the newest one whenever there is one; maps in between are skipped.
@@ -118,9 +113,7 @@ class FleetClient:
             if self._gone_at_s is not None and self._loop.time() > self._gone_at_s + GONE_S:
                 raise RunError(f"the fusion node has been away for {GONE_S:.0f} s: is it still running?")
             with contextlib.suppress(TimeoutError):
-                async with self._changed:
-                    if self._newest is seen:
-                        await asyncio.wait_for(self._changed.wait(), LOOK_S)
+                await asyncio.wait_for(self._changed.wait(), LOOK_S)
 
 
 @contextlib.asynccontextmanager

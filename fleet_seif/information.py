@@ -192,6 +192,7 @@ class FrameTotal:
         self._offsets = np.zeros(64, np.int64)
         self._values = np.zeros(256, np.int64)
         self._used = np.zeros(2, np.int64)  # slots, values
+        self._delta: FrameDelta | None = None
 
     def add(self, delta: FrameDelta) -> None:
         """Fold one delta. Raises NumericalError, with nothing changed, where a sum would reach 2^60 quanta."""
@@ -203,6 +204,7 @@ class FrameTotal:
             raise NumericalError(
                 "a frame total would exceed 2^60 quanta (H 2^-28, b 2^-24): the vehicle claims absurd information"
             )
+        self._delta = None
 
     def subtract(self, delta: FrameDelta) -> None:
         """Take back one delta that was added."""
@@ -222,7 +224,15 @@ class FrameTotal:
             self._values = grown
 
     def delta(self) -> FrameDelta:
-        """The whole total as one delta from nothing, without blocks that are zero, in canonical order."""
+        """The whole total as one delta from nothing, without blocks that are zero, in canonical order.
+
+        Made anew only after a change; the arrays are shared, so treat them as read-only.
+        """
+        if self._delta is None:
+            self._delta = self._export()
+        return self._delta
+
+    def _export(self) -> FrameDelta:
         taken = np.flatnonzero(self._keys != -1)
         order = taken[np.argsort(self._keys[taken])]
         rows, cols, H, names, b = _export(self._keys, self._offsets, self._values, order)

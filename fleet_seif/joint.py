@@ -131,11 +131,6 @@ def _rows_of_poses(lives: Sequence[Life], first: int) -> tuple[list[tuple[str, i
     return poses, rows
 
 
-def _frame_mean(info: FrameInformation) -> Floats:
-    """The frame's own solution, shape (n,)."""
-    return _Factor(info.H).solve(info.b)
-
-
 class _Factor:
     """A sparse factor of a symmetric positive definite matrix: factored once, solved with many."""
 
@@ -156,27 +151,23 @@ class _Factor:
         return np.asarray(self._lu.solve(np.asarray(b, float)))
 
 
-def _start_state(
-    lives: Sequence[Life], frames: Sequence[tuple[int, _Frame]], rows: dict[tuple[int, int], int], size: int
-) -> Floats:
+def _start_state(frames: Sequence[tuple[int, _Frame]], size: int) -> Floats:
     """First estimate: each frame's own mean, carried through the frame poses; the first to see a landmark wins."""
     x, seen = np.zeros(size), np.zeros(size, bool)
     pose = np.zeros(3)
-    frame_number = 0
     life_now = -1
     for i, frame in frames:
         if i != life_now:
-            life_now, frame_number, pose = i, 0, np.asarray(lives[i].start_pose, float)
-            if rows[i, 0] >= 0:
-                x[rows[i, 0] : rows[i, 0] + 3] = pose
-        mean = _frame_mean(frame.info)
+            life_now, pose = i, frame.given_start
+            if frame.start_row >= 0:
+                x[frame.start_row : frame.start_row + 3] = pose
+        mean = _Factor(frame.info.H).solve(frame.info.b)
         points = act_all(pose, mean[3:].reshape(-1, 2))
         for row, point in zip(frame.landmark_rows, points, strict=True):
             if not seen[row]:
                 x[row : row + 2], seen[row] = point, True
         pose = compose(pose, mean[:3])
-        frame_number += 1
-        x[rows[i, frame_number] : rows[i, frame_number] + 3] = pose
+        x[frame.end_row : frame.end_row + 3] = pose
     return x
 
 
@@ -264,7 +255,7 @@ def solve(lives: Sequence[Life], classes: tuple[tuple[LandmarkName, ...], ...]) 
         for i, life in enumerate(lives)
         if rows[i, 0] >= 0
     ]
-    x = _start_state(lives, frames, rows, size)
+    x = _start_state(frames, size)
     linear = not priors and all(len(life.frames) == 1 for life in lives)
     for _ in range(ITERATIONS_MAX):
         H, g = assemble(frames, priors, x)

@@ -2,7 +2,7 @@
 
 1. Every message goes to the ledger; what it says decides about acknowledgements and repairs.
 2. A gap is known from a parked message or a heartbeat. It is asked for after `repair_after_s`; without progress the
-   wait doubles up to `repair_max_s`. One query a stream at a time, which counts as lost after `query_s`.
+   wait doubles up to `repair_max_s`. One query a stream at a time, which counts as lost after `QUERY_LOST_S`.
 3. Acknowledgements go out every `ack_every` messages or `ack_s`, and again with every heartbeat.
 4. Times are this node's own monotonic clock; nothing compares them with another's.
 """

@@ -19,7 +19,7 @@ import numpy as np
 
 from fleet_seif.envelope import KIND_SNAPSHOT, body_digest, kind_of
 from fleet_seif.errors import NumericalError, WireError
-from fleet_seif.information import FrameDelta, FrameTotal, delta_digest
+from fleet_seif.information import FrameTotal, delta_digest
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello, Snapshot
 from fleet_seif.records import Floats
 from fleet_seif.streams import EMPTY_PREFIX, extend_prefix
@@ -43,23 +43,6 @@ class Frame:
 
     total: FrameTotal = field(default_factory=FrameTotal)
     end_pose: Floats | None = None
-    _cumulative: FrameDelta | None = None
-
-    def add(self, delta: FrameDelta) -> None:
-        """Fold one delta. Raises NumericalError, with nothing changed, where a sum would outgrow its range."""
-        self.total.add(delta)
-        self._cumulative = None
-
-    def subtract(self, delta: FrameDelta) -> None:
-        """Take back one delta."""
-        self.total.subtract(delta)
-        self._cumulative = None
-
-    def cumulative(self) -> FrameDelta:
-        """The whole total as one delta; made anew only after a change."""
-        if self._cumulative is None:
-            self._cumulative = self.total.delta()
-        return self._cumulative
 
 
 @dataclass
@@ -164,12 +147,12 @@ class Ledger:
         opened = {part.frame for part in message.parts} - set(stream.frames)
         try:
             for part in message.parts:
-                stream.frames.setdefault(part.frame, Frame()).add(part.delta)
+                stream.frames.setdefault(part.frame, Frame()).total.add(part.delta)
                 done.append(part)
         except NumericalError as error:
             stream.fault = f"message {message.first}: {error}"
             for part in done:
-                stream.frames[part.frame].subtract(part.delta)
+                stream.frames[part.frame].total.subtract(part.delta)
             for frame in opened:
                 stream.frames.pop(frame, None)
             return Receipt.REFUSED
@@ -238,7 +221,7 @@ class Ledger:
             digest.update(stream.hello.start_pose.tobytes() + stream.hello.start_pose_cov.tobytes())
             digest.update(np.array(stream.signatures, "<i8").tobytes())
             for frame in sorted(stream.frames):
-                total = stream.frames[frame].cumulative()
+                total = stream.frames[frame].total.delta()
                 if len(total.variables):
                     digest.update(frame.to_bytes(8, "little") + delta_digest(total))
         return digest.digest()

@@ -32,7 +32,7 @@ def lives_of(ledger: Ledger) -> tuple[Life, ...]:
             life=stream.life,
             start_pose=stream.hello.start_pose,
             start_pose_cov=stream.hello.start_pose_cov,
-            frames=tuple(stream.frames[f].cumulative() for f in sorted(stream.frames)),
+            frames=tuple(stream.frames[f].total.delta() for f in sorted(stream.frames)),
             signatures=tuple(stream.signatures),
         )
         for stream in ledger.placed()

@@ -56,7 +56,6 @@ class FusionService:
         self,
         bus: Bus,
         core: FusionCore,
-        fleet: str,
         settings: FusionSettings,
         clock: Callable[[], float] = time.monotonic,
         maps: Bus | None = None,
@@ -65,10 +64,9 @@ class FusionService:
         self._bus = bus
         self._maps = maps or bus
         self._core = core
-        self._fleet = fleet
         self._settings = settings
         self._clock = clock
-        self._keys = Keys(fleet)
+        self._keys = Keys(core.ledger.fleet)
         self._inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -76,7 +74,7 @@ class FusionService:
         self._alive: set[str] = set()
         self._changed_at_s: float | None = None
         self._served = b""
-        self.newest: JointMap = empty_map(fleet, first_version - 1)
+        self.newest: JointMap = empty_map(core.ledger.fleet, first_version - 1)
         self.statistics = Statistics()
         bus.subscribe(self._keys.deltas("*"), self._on_delta)
         bus.subscribe(self._keys.heartbeats("*"), self._on_heartbeat)

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import logging
 import os
 import signal
 import sys
@@ -26,7 +25,6 @@ from scenarios.source import record, vehicle_names
 from vehicles import Vehicle
 from vehicles.drive import drive
 
-log = logging.getLogger(__name__)
 PROGRESS_S = 0.2
 SWITCH_S = 1e-4  # a step must not wait 5 ms for the threads that serve the network
 
@@ -102,7 +100,7 @@ def run_fusion(
     ):
         core = FusionCore(fleet, "fusion", settings, expected)
         version = time.time_ns() // 1_000_000  # so that the maps of a node started again count as newer
-        service = FusionService(bus, core, fleet, settings, maps=session, first_version=version)
+        service = FusionService(bus, core, settings, maps=session, first_version=version)
         say({"event": "listening", "endpoint": session.endpoints()[0]})
 
         silent: set[str] = set()

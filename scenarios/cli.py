@@ -96,6 +96,8 @@ def run(
     with progress_bars(console, totals, quiet) as progress:
         if virtual:
             finished = run_virtual(scenario, chosen, recording, progress)
+            if out is not None:  # in a real run the fusion process writes it
+                output.write_ledger(out / "process" / "ledger.bin", finished.ledger)
         else:
             again = [scenario, *(part for item in settings or () for part in ("--set", item))]
             again += ["--seed", str(chosen.run.seed)]

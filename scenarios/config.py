@@ -96,7 +96,7 @@ def load_scenario(name: str, overrides: tuple[str, ...] = (), seed: int | None =
     try:
         return Scenario.model_validate(tables)
     except ValidationError as error:
-        raise ScenarioError(_explain(source, error, tables)) from None
+        raise ScenarioError(_explain(source, error)) from None
 
 
 def _override(tables: dict[str, Any], override: str) -> None:
@@ -114,7 +114,7 @@ def _override(tables: dict[str, Any], override: str) -> None:
     table[names[1]] = parsed
 
 
-def _explain(source: str, error: ValidationError, tables: dict[str, Any]) -> str:
+def _explain(source: str, error: ValidationError) -> str:
     lines = []
     for fault in error.errors():
         where = ".".join(str(part) for part in fault["loc"])

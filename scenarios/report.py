@@ -95,7 +95,6 @@ def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
         output.write_trajectory(folder / "trajectory" / f"{name}_truth.tum", log.time_s, log.truth_pose)
     output.write_truth(folder, run.recording)
     output.write_map(folder, outcome.solution, outcome.landmark_cov, outcome.score.landmark_truth)
-    output.write_ledger(folder / "process" / "ledger.bin", run.ledger)
     times = figure_times(run.scenario.figure, run.recording)
     draw_figure(
         folder / "figure.png",

@@ -189,10 +189,7 @@ class _VirtualVehicle:
 
     def result(self) -> DriveResult:
         core = self.core
-        return self._notes.result(
-            core.landmarks, core.filter.signatures, core.counters.bytes_put, core.counters.messages,
-            core.counters.readings_refused, core.counters.sightings_refused,
-        )  # fmt: skip
+        return self._notes.result(core.landmarks, core.filter.signatures, core.counters)
 
 
 def run_virtual(

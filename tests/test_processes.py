@@ -146,18 +146,25 @@ def test_a_figure_is_drawn(finished: Path) -> None:
     assert (finished / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_interrupting_a_run_ends_every_process() -> None:
+@contextlib.contextmanager
+def slow_run() -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
+    """A run of two vehicles that takes minutes, once its three processes are there, and those."""
     run = subprocess.Popen(
         [*COMMAND, "run", "fleet", "--set", "fleet.vehicles=2", "--set", "run.rate_hz=1"],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     try:
         wait_until(lambda: len(children_of(run.pid)) == 3, "three processes")
-        children = children_of(run.pid)
-        run.send_signal(signal.SIGINT)
-        _, errors = run.communicate(timeout=PATIENCE_S)
+        yield run, children_of(run.pid)
     finally:
         run.kill()
+        run.communicate()
+
+
+def test_interrupting_a_run_ends_every_process() -> None:
+    with slow_run() as (run, children):
+        run.send_signal(signal.SIGINT)
+        _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 130
     assert "interrupted" in errors
     assert "Traceback" not in errors
@@ -165,37 +172,20 @@ def test_interrupting_a_run_ends_every_process() -> None:
 
 
 def test_a_killed_launcher_takes_its_processes_with_it() -> None:
-    run = subprocess.Popen(
-        [*COMMAND, "run", "fleet", "--set", "fleet.vehicles=2", "--set", "run.rate_hz=1"],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-    )  # fmt: skip
-    wait_until(lambda: len(children_of(run.pid)) == 3, "three processes")
-    children = children_of(run.pid)
-    run.kill()
-    run.wait()
-    wait_until(lambda: not any(running(pid) for pid in children), "the end of the children")
+    with slow_run() as (run, children):
+        run.kill()
+        run.wait()
+        wait_until(lambda: not any(running(pid) for pid in children), "the end of the children")
 
 
 def test_a_vehicle_that_dies_ends_the_run_with_its_name() -> None:
-    run = subprocess.Popen(
-        [*COMMAND, "run", "fleet", "--set", "fleet.vehicles=2", "--set", "run.rate_hz=1"],
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
-    try:
-        wait_until(lambda: len(children_of(run.pid)) == 3, "three processes")
-        victim = next(
-            pid
-            for pid in children_of(run.pid)
-            if b"--name\0v2\0" in (Path("/proc") / str(pid) / "cmdline").read_bytes()
-        )
-        others = [pid for pid in children_of(run.pid) if pid != victim]
+    with slow_run() as (run, children):
+        victim = next(pid for pid in children if b"--name\0v2\0" in command_line(pid))
         os.kill(victim, signal.SIGKILL)
         _, errors = run.communicate(timeout=PATIENCE_S)
-    finally:
-        run.kill()
     assert run.returncode == 1
     assert "process v2 ended with code -9" in errors
-    assert not any(running(pid) for pid in others)
+    assert not any(running(pid) for pid in children if pid != victim)
 
 
 @contextlib.contextmanager

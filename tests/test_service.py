@@ -32,7 +32,7 @@ def stream(name: str) -> list[bytes]:
 
 
 def test_every_event_of_a_burst_is_handled(network: Network) -> None:
-    service = FusionService(network.bus, FusionCore("f", "node", SETTINGS), "f", SETTINGS)
+    service = FusionService(network.bus, FusionCore("f", "node", SETTINGS), SETTINGS)
     handled: list[int] = []
 
     def event(i: int) -> list[Effect]:
@@ -47,7 +47,7 @@ def test_every_event_of_a_burst_is_handled(network: Network) -> None:
 
 
 def test_a_vehicle_that_falls_silent_is_shown_stalled_without_any_news(network: Network) -> None:
-    service = FusionService(network.bus, FusionCore("f", "node", SETTINGS), "f", SETTINGS)
+    service = FusionService(network.bus, FusionCore("f", "node", SETTINGS), SETTINGS)
     stalled = threading.Event()
     worker = threading.Thread(target=service.run)
     worker.start()
@@ -83,6 +83,6 @@ def test_a_final_map_that_cannot_be_solved_is_an_error(network: Network) -> None
     negated = dataclasses.replace(part, delta=dataclasses.replace(part.delta, H=-part.delta.H))
     core.on_delta("bad", encode_message(dataclasses.replace(message, parts=(negated,))), 0.0)
     core.on_delta("bad", stream("bad")[1], 0.0)
-    service = FusionService(network.bus, core, "f", SETTINGS)
+    service = FusionService(network.bus, core, SETTINGS)
     with pytest.raises(ArithmeticError):
         service.run()

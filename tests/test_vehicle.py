@@ -88,7 +88,7 @@ def test_a_vehicle_that_nobody_hears_keeps_a_bounded_outbox() -> None:
 
 def test_a_connected_vehicle_is_fused_and_acknowledged(network: Network) -> None:
     core = FusionCore("fleet", "node", FusionSettings(), expected=1)
-    service = FusionService(network.bus, core, "fleet", FusionSettings(map_s=0.02))
+    service = FusionService(network.bus, core, FusionSettings(map_s=0.02))
     fusing = threading.Thread(target=service.run)
     fusing.start()
     with open_bus(connect=[network.endpoint]) as bus, Vehicle("mine", bus=bus, start_pose=(1, 1, 0)) as vehicle:

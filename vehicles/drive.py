@@ -9,6 +9,7 @@ import numpy as np
 
 from fleet_seif.errors import NumericalError, ReadingRefused, RunError
 from fleet_seif.records import Floats, Ints, Reading, Sightings
+from vehicles.core import Counters
 from vehicles.vehicle import Vehicle
 
 log = logging.getLogger(__name__)
@@ -43,9 +44,7 @@ class Notes:
     filter_s: list[float] = field(default_factory=list)
     publish_s: list[float] = field(default_factory=list)
 
-    def result(
-        self, landmarks: Floats, signatures: list[int], bytes_put: int, messages: int, readings: int, sightings: int
-    ) -> DriveResult:
+    def result(self, landmarks: Floats, signatures: list[int], counters: Counters) -> DriveResult:
         """All of it, with what the vehicle counted."""
         return DriveResult(
             pose=np.array(self.pose).reshape(-1, 3),
@@ -53,10 +52,10 @@ class Notes:
             signatures=np.array(signatures, np.int64),
             filter_s=np.array(self.filter_s),
             publish_s=np.array(self.publish_s),
-            bytes_put=bytes_put,
-            messages=messages,
-            readings_refused=readings,
-            sightings_refused=sightings,
+            bytes_put=counters.bytes_put,
+            messages=counters.messages,
+            readings_refused=counters.readings_refused,
+            sightings_refused=counters.sightings_refused,
         )
 
 
@@ -97,11 +96,7 @@ def drive(
         if vehicle.acknowledged == acknowledged:
             raise _silence()
         acknowledged = vehicle.acknowledged
-    counters = vehicle.counters
-    return notes.result(
-        vehicle.landmarks, vehicle.signatures, counters.bytes_put, counters.messages,
-        counters.readings_refused, counters.sightings_refused,
-    )  # fmt: skip
+    return notes.result(vehicle.landmarks, vehicle.signatures, vehicle.counters)
 
 
 def _silence() -> RunError:
