@@ -1,12 +1,18 @@
 """The bus: the only module that knows Zenoh.
 
-A `put` is best effort (congestion control DROP): what must not be lost is numbered, announced by heartbeats and asked
-for again by whoever finds it missing. Handlers run on Zenoh's threads and must only hand on what they get.
+1. A `put` is best effort (congestion control DROP): what must not be lost is numbered, announced by heartbeats and
+   asked for again by whoever finds it missing. While there is no router to reach, a `put` is dropped.
+2. A client uses the first of its endpoints that answers. When its router dies it goes to the next one by itself, and
+   all it has declared goes with it: at once after a crash, after LEASE_MS + OPEN_MS where nothing says that it is gone.
+3. Routers link to the routers they `connect` to, and go on trying while those are not there.
+4. Handlers run on Zenoh's threads and must only hand on what they get. One that raises is logged, and called again.
 """
 
 import contextlib
 import ipaddress
 import json
+import logging
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -15,34 +21,55 @@ import zenoh
 
 from fleet_seif.errors import RunError
 
+log = logging.getLogger(__name__)
+
 OnPut = Callable[[str, bytes], None]
 OnQuery = Callable[[str, bytes], list[bytes]]
-CONNECT_MS = 5000
-QUERY_MS = 2000
-LEASE_MS = 2000
+OnReply = Callable[[bytes], None]
+OnDone = Callable[[], None]
+OnAlive = Callable[[str, bool], None]
 Mode = Literal["router", "client"]
+Priority = Literal["control", "data", "bulk"]  # on a full link the first goes first, and is the last to be dropped
+
+CONNECT_MS = 5000  # how long a client looks for a first router
+QUERY_MS = 2000
+LEASE_MS = 2000  # a link on which nothing arrives for so long is dead
+OPEN_MS = 1000  # one attempt to connect; a lost SYN would otherwise be repeated after 1, 3, 7, 15, 31 s
+RETRY_MS = (100, 250)  # between attempts, first and longest
+SEND_BUFFER_BYTES = 1 << 16  # of a socket: more only queues where no priority helps, 0.9 s of it at 8 Mbit/s
+PRIORITIES: dict[Priority, Any] = {
+    "control": zenoh.Priority.INTERACTIVE_HIGH,
+    "data": zenoh.Priority.DATA,
+    "bulk": zenoh.Priority.DATA_LOW,
+}
 
 
 class Bus(Protocol):
     """What the processes need of a bus."""
 
-    def put(self, key: str, payload: bytes) -> None:
-        """Send, best effort."""
+    def put(self, key: str, payload: bytes, priority: Priority = "data") -> None:
+        """Send, best effort. Messages of one priority stay in order; of different ones they may not."""
 
     def subscribe(self, key: str, handler: OnPut) -> None:
         """Call handler(key, payload) for what is put under a key expression."""
 
     def answer(self, key: str, handler: OnQuery) -> None:
-        """Answer queries for a key with any number of payloads."""
+        """Answer queries for a key with any number of payloads: handler(key asked for, payload).
 
-    def ask(self, key: str, payload: bytes, on_reply: Callable[[bytes], None], on_done: Callable[[], None]) -> None:
-        """Query; replies arrive one by one, then on_done is called once, also after a timeout."""
+        A key with `*` answers for every key it matches; the handler is told which one was asked for.
+        """
+
+    def ask(self, key: str, payload: bytes, on_reply: OnReply, on_done: OnDone) -> None:
+        """Query everybody who answers for a key.
+
+        Replies of all arrive one by one, then on_done is called once, after QUERY_MS at the latest.
+        """
 
     def announce(self, key: str) -> None:
         """Be seen alive under a key as long as the bus is open."""
 
-    def watch(self, key: str, handler: Callable[[str, bool], None]) -> None:
-        """Call handler(key, alive) as others appear and disappear."""
+    def watch(self, key: str, handler: OnAlive) -> None:
+        """Call handler(key, alive) as others appear and disappear, first for those who are there already."""
 
     def close(self) -> None: ...
 
@@ -73,7 +100,7 @@ def check_endpoints(endpoints: Sequence[str], insecure: bool) -> None:
             )
 
 
-def _configuration(mode: str, listen: Sequence[str], connect: Sequence[str], file: Path | None) -> zenoh.Config:
+def _configuration(mode: Mode, listen: Sequence[str], connect: Sequence[str], file: Path | None) -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(str(file)) if file else zenoh.Config()
     except Exception as error:  # zenoh raises its own kind for anything wrong in the file
@@ -85,8 +112,19 @@ def _configuration(mode: str, listen: Sequence[str], connect: Sequence[str], fil
         "scouting/delay": 0,
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tcp/so_sndbuf": SEND_BUFFER_BYTES,
+        "transport/link/tls/so_sndbuf": SEND_BUFFER_BYTES,
+        "transport/unicast/open_timeout": OPEN_MS,
         "queries_default_timeout": QUERY_MS,
-        "connect/timeout_ms": CONNECT_MS,
+        # A router tries for ever and in the background. A client tries each endpoint once, and `_open` repeats that:
+        # with a timeout Zenoh 1.10 would spend it all on the first endpoint.
+        "connect/timeout_ms": -1 if mode == "router" else 0,
+        "connect/exit_on_failure": mode == "client",
+        "connect/retry": {
+            "period_init_ms": RETRY_MS[0],
+            "period_max_ms": RETRY_MS[1],
+            "period_increase_factor": 2,
+        },
         "adminspace/enabled": True,
     }
     if listen or mode == "client" or not file:
@@ -105,6 +143,27 @@ def _endpoints_of(configuration: zenoh.Config, key: str) -> list[str]:
     return list(found)
 
 
+def _open(configuration: zenoh.Config, mode: Mode) -> Any:
+    """A session. A client looks for a router for CONNECT_MS; raises what Zenoh raises at the end of it."""
+    end_s = time.monotonic() + CONNECT_MS / 1000
+    while True:
+        try:
+            return zenoh.open(configuration)
+        except Exception:  # zenoh raises its own kind for anything that goes wrong here
+            if mode == "router" or time.monotonic() >= end_s:
+                raise
+        time.sleep(RETRY_MS[0] / 1000)
+
+
+@contextlib.contextmanager
+def _logged(what: str, key: str) -> Iterator[None]:
+    """Log what a handler raises: Zenoh would swallow it."""
+    try:
+        yield
+    except Exception:
+        log.exception("handler_failed in=%s key=%s", what, key)
+
+
 class ZenohBus:
     """A Zenoh session. Keeps references to all it declared: they die when collected."""
 
@@ -112,38 +171,51 @@ class ZenohBus:
         self._session = session
         self._declared: list[Any] = []
 
-    def put(self, key: str, payload: bytes) -> None:
-        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
+    def put(self, key: str, payload: bytes, priority: Priority = "data") -> None:
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP, priority=PRIORITIES[priority])
 
     def subscribe(self, key: str, handler: OnPut) -> None:
         def receive(sample: Any) -> None:
-            handler(str(sample.key_expr), sample.payload.to_bytes())
+            with _logged("subscribe", key):
+                handler(str(sample.key_expr), sample.payload.to_bytes())
 
         self._declared.append(self._session.declare_subscriber(key, receive))
 
     def answer(self, key: str, handler: OnQuery) -> None:
         def receive(query: Any) -> None:
-            with query:
+            with _logged("answer", key), query:
+                asked = str(query.key_expr)
                 payload = query.payload.to_bytes() if query.payload is not None else b""
-                for reply in handler(str(query.key_expr), payload):
-                    query.reply(key, reply)
+                for reply in handler(asked, payload):
+                    query.reply(asked if "*" in key else key, reply)
 
         self._declared.append(self._session.declare_queryable(key, receive))
 
-    def ask(self, key: str, payload: bytes, on_reply: Callable[[bytes], None], on_done: Callable[[], None]) -> None:
+    def ask(self, key: str, payload: bytes, on_reply: OnReply, on_done: OnDone) -> None:
         def receive(reply: Any) -> None:
             if reply.ok is not None:
-                on_reply(reply.ok.payload.to_bytes())
+                with _logged("ask", key):
+                    on_reply(reply.ok.payload.to_bytes())
 
-        handler = zenoh.handlers.Callback(receive, drop=on_done)
-        self._session.get(key, handler, payload=payload, consolidation=zenoh.ConsolidationMode.NONE)
+        def done() -> None:
+            with _logged("ask", key):
+                on_done()
+
+        self._session.get(
+            key,
+            zenoh.handlers.Callback(receive, drop=done),
+            payload=payload,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
 
     def announce(self, key: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(key))
 
-    def watch(self, key: str, handler: Callable[[str, bool], None]) -> None:
+    def watch(self, key: str, handler: OnAlive) -> None:
         def receive(sample: Any) -> None:
-            handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+            with _logged("watch", key):
+                handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         subscriber = self._session.liveliness().declare_subscriber(key, receive, history=True)
         self._declared.append(subscriber)
@@ -170,7 +242,8 @@ def open_bus(
     """A Zenoh session: a router that others connect to, or a client of one.
 
     Args:
-        listen, connect: endpoints; where empty, those of the configuration file, if there is one.
+        listen: where a router listens. connect: the routers a client may use, in order of preference, or those that a
+            router links to, which need not be there yet. Where empty: those of the configuration file, if there is one.
         mode: by default a router where `listen` is given, a client otherwise.
 
     Raises RunError where an endpoint is malformed, taken, not reachable or not protected.
@@ -181,9 +254,9 @@ def open_bus(
     listen, connect = _endpoints_of(configuration, "listen"), _endpoints_of(configuration, "connect")
     check_endpoints([*listen, *connect], insecure)
     try:
-        session = zenoh.open(configuration)
-    except Exception as error:  # zenoh raises its own kind for anything that goes wrong here
-        if listen:
+        session = _open(configuration, mode)
+    except Exception as error:
+        if mode == "router":
             reason = f"cannot listen on {', '.join(listen)} (port taken, or address not of this machine?)"
         else:
             reason = f"cannot reach a fusion node at {', '.join(connect)}: start it first, or check the address"

@@ -4,6 +4,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from fleet_seif.messages import NAME_MAX
+
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -23,6 +25,8 @@ class FilterSettings(Settings):
     gate: squared normalised innovation (chi-square, 2 degrees of freedom) above which a sighting is refused.
     gate_patience: refusals of one landmark in a row after which its next sighting is believed.
     start_information: of the frame's first pose, per m^2 and rad^2.
+    step_information_max: the most that a diagonal entry of H may grow by in a step, per m^2 and rad^2; a reading that
+    claims more is refused. The vehicle declares it, and fusion nodes hold it to it.
     """
 
     active_max: Annotated[int, Field(ge=1, le=1000)] = 6
@@ -30,6 +34,7 @@ class FilterSettings(Settings):
     gate: Positive = 30.0
     gate_patience: Annotated[int, Field(ge=1, le=1000)] = 3
     start_information: Annotated[float, Field(gt=0, le=1e9)] = 1e6
+    step_information_max: Annotated[float, Field(gt=0, le=1e9)] = 1e9
 
 
 class PublishSettings(Settings):
@@ -37,20 +42,26 @@ class PublishSettings(Settings):
 
     window: messages that may be put past the last acknowledgement.
     outbox_max: messages kept until acknowledged; beyond it the unsent ones are coalesced.
-    heartbeat_s: time between heartbeats.
+    heartbeat_s: time between heartbeats. nodes_max: fusion nodes whose acknowledgements are kept track of.
     """
 
     window: Annotated[int, Field(ge=1, le=100_000)] = 256
     outbox_max: Annotated[int, Field(ge=16, le=1_000_000)] = 20_000
     heartbeat_s: Positive = 0.25
+    nodes_max: Annotated[int, Field(ge=1, le=1000)] = 32
 
 
 class FusionSettings(Settings):
     """How a fusion node works.
 
-    parked_max: early messages kept for a vehicle; later ones are dropped and asked for again.
+    parked_max, parked_bytes_max: early messages of an epoch, and their bytes of a vehicle, that are kept;
+    parked_bytes_all_max: of all vehicles; gap_max: numbers that an early message may be ahead. What goes beyond is
+    dropped and asked for again.
+    ledger_bytes_max: bytes of messages a node keeps; at compact_bytes it starts to compact.
+    required_acks: the fusion nodes that must have acknowledged a message before its vehicle forgets it; none: any one.
     repair_after_s: how long a gap may stand before it is asked for; doubled up to repair_max_s without progress.
-    repair_batch: messages asked for at a time.
+    repair_batch: messages asked for at a time; queries_max: queries under way at a time.
+    status_s: time between two reports to the other nodes.
     ack_every: messages folded before an acknowledgement is sent at once; ack_s: otherwise after this time.
     map_s: least time between two served maps.
     stalled_s: silence after which a vehicle counts as stalled.
@@ -58,9 +69,17 @@ class FusionSettings(Settings):
     """
 
     parked_max: Annotated[int, Field(ge=1, le=1_000_000)] = 4096
+    parked_bytes_max: Annotated[int, Field(ge=1)] = 64 * 2**20
+    parked_bytes_all_max: Annotated[int, Field(ge=1)] = 512 * 2**20
+    gap_max: Annotated[int, Field(ge=1)] = 1_000_000
+    ledger_bytes_max: Annotated[int, Field(ge=1)] = 2**30
+    compact_bytes: Annotated[int, Field(ge=1)] = 256 * 2**20
+    required_acks: tuple[Annotated[str, Field(pattern=rf"^[A-Za-z0-9_-]{{1,{NAME_MAX}}}$")], ...] = ()
     repair_after_s: Positive = 0.1
     repair_max_s: Positive = 2.0
     repair_batch: Annotated[int, Field(ge=1, le=4096)] = 256
+    queries_max: Annotated[int, Field(ge=1, le=10_000)] = 32
+    status_s: Positive = 0.5
     ack_every: Annotated[int, Field(ge=1, le=4096)] = 32
     ack_s: Positive = 0.05
     map_s: Positive = 0.2

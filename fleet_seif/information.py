@@ -62,6 +62,26 @@ def variable_size(variable: int) -> int:
 
 
 @kernel
+def _largest_diagonal(variables: Ints, rows: Ints, cols: Ints, H: Ints) -> int:
+    largest = at = 0
+    for k in range(len(rows)):
+        row, col = variables[rows[k]], variables[cols[k]]
+        if row == col:
+            n = variable_size(row)
+            i = at
+            for r in range(n):
+                largest = max(largest, H[i])
+                i += n - r
+        at += block_size(row, col)
+    return largest
+
+
+def largest_growth(delta: FrameDelta) -> int:
+    """The largest entry on the diagonal of a delta's H, in quanta, at least 0."""
+    return _largest_diagonal(delta.variables, delta.rows, delta.cols, delta.H)
+
+
+@kernel
 def _hash(key: int, mask: int) -> int:
     return ((key >> 32) * 73856093 + (key & 0xFFFFFFFF) * 19349663) & mask
 
@@ -120,6 +140,16 @@ def _rehash(keys: Ints, offsets: Ints, new_keys: Ints, new_offsets: Ints) -> Non
 
 
 @kernel
+def _copy_unless_zero(out: Ints, values: Ints) -> bool:
+    """Copy values to the beginning of `out` and say so, unless all are zero."""
+    found = False
+    for i in range(len(values)):
+        out[i] = values[i]
+        found |= values[i] != 0
+    return found
+
+
+@kernel
 def _export(keys: Ints, offsets: Ints, values: Ints, order: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
     """Non-zero blocks and vectors, slots in `order`: block rows, cols, values; vector variables, values."""
     rows, cols = np.empty(len(order), np.int64), np.empty(len(order), np.int64)
@@ -130,15 +160,13 @@ def _export(keys: Ints, offsets: Ints, values: Ints, order: Ints) -> tuple[Ints,
         at = offsets[slot]
         if col == -1:
             size = variable_size(row)
-            if np.any(values[at : at + size] != 0):
+            if _copy_unless_zero(b[w:], values[at : at + size]):
                 names[v] = row
-                b[w : w + size] = values[at : at + size]
                 v, w = v + 1, w + size
         else:
             size = block_size(row, col)
-            if np.any(values[at : at + size] != 0):
+            if _copy_unless_zero(H[h:], values[at : at + size]):
                 rows[n], cols[n] = row, col
-                H[h : h + size] = values[at : at + size]
                 n, h = n + 1, h + size
     return rows[:n].copy(), cols[:n].copy(), H[:h].copy(), names[:v].copy(), b[:w].copy()
 

@@ -91,19 +91,54 @@ class JointSolution:
         return rows
 
 
-def landmark_classes(lives: Sequence[Life]) -> tuple[tuple[LandmarkName, ...], ...]:
+Pair = tuple[LandmarkName, LandmarkName]
+
+
+def landmark_classes(
+    lives: Sequence[Life], forced: Sequence[Pair] = (), forbidden: Sequence[Pair] = ()
+) -> tuple[tuple[LandmarkName, ...], ...]:
     """Which landmarks are the same: those that carry one signature. In canonical order of their first names.
 
     Landmarks whose rows are all zero in every frame are none and do not appear.
+
+    Args:
+        forced: pairs that are one landmark whatever they carry, joined first and in this order.
+        forbidden: pairs that are two: what would join them, a forced pair too, does nothing.
     """
     groups: dict[object, list[LandmarkName]] = {}
+    names: list[LandmarkName] = []
     for life in lives:
         present = [delta.variables[delta.variables != POSE] - 1 for delta in life.frames]
         for number in np.unique(np.concatenate(present)).tolist() if present else []:
             name = LandmarkName(life.vehicle, life.life, number)
+            names.append(name)
             signature = life.signatures[number]
             groups.setdefault(name if signature == UNKNOWN_SIGNATURE else signature, []).append(name)
+    if forced or forbidden:
+        same = [(group[0], other) for group in map(sorted, groups.values()) for other in group[1:]]
+        return _joined(names, [*forced, *sorted(same)], forbidden)
     return tuple(sorted(tuple(sorted(group)) for group in groups.values()))
+
+
+def _joined(
+    names: Sequence[LandmarkName], pairs: Sequence[Pair], forbidden: Sequence[Pair]
+) -> tuple[tuple[LandmarkName, ...], ...]:
+    """Classes of names: pairs are joined in order, but for those that would put a forbidden pair into one class."""
+    classes = {name: {name} for name in names}
+    apart: dict[LandmarkName, set[LandmarkName]] = {}
+    for a, b in forbidden:
+        apart.setdefault(a, set()).add(b)
+        apart.setdefault(b, set()).add(a)
+    for a, b in pairs:
+        if a not in classes or b not in classes or classes[a] is classes[b]:
+            continue
+        one, other = classes[a], classes[b]
+        if any(not apart[name].isdisjoint(other) for name in one & apart.keys()):
+            continue
+        one |= other
+        for name in other:
+            classes[name] = one
+    return tuple(sorted({tuple(sorted(group)) for group in classes.values()}))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
-"""Where things are on the bus: `fleet_seif/1/<fleet>/...`."""
+"""Where things are on the bus: `fleet_seif/2/<fleet>/...`."""
 
 from fleet_seif.messages import check_name
 
-ROOT = "fleet_seif/1"
+ROOT = "fleet_seif/2"
 
 
 class Keys:
@@ -30,16 +30,37 @@ class Keys:
         """Acknowledgements for a vehicle are put here."""
         return f"{self._stem}/vehicle/{vehicle}/ack"
 
-    def node(self, node: str) -> str:
-        """Liveliness token of a fusion node; `*` for all."""
-        return f"{self._stem}/node/{node}"
+    def ledger(self, vehicle: str) -> str:
+        """Fusion nodes answer range queries here too; `*` for all vehicles."""
+        return f"{self._stem}/vehicle/{vehicle}/ledger"
 
-    def map(self) -> str:
-        """Maps are put here in pieces, and queried whole."""
-        return f"{self._stem}/map"
+    def node_alive(self, node: str) -> str:
+        """Liveliness token of a fusion node; `*` for all."""
+        return f"{self._stem}/node/{node}/alive"
+
+    def status(self, node: str) -> str:
+        """Fusion nodes tell each other here how far they are."""
+        return f"{self._stem}/node/{node}/status"
+
+    def events(self, node: str) -> str:
+        """Answers with the operator events and the evidence that a node holds."""
+        return f"{self._stem}/node/{node}/events"
+
+    def map(self, node: str) -> str:
+        """A node's maps are put here in pieces, and queried whole; `*` for all nodes."""
+        return f"{self._stem}/node/{node}/map"
 
 
 def vehicle_of(key: str) -> str:
-    """The vehicle in a key that names one, '' otherwise."""
+    """The vehicle in a key that names one, "" otherwise."""
+    return _named(key, "vehicle")
+
+
+def node_of(key: str) -> str:
+    """The fusion node in a key that names one, "" otherwise."""
+    return _named(key, "node")
+
+
+def _named(key: str, kind: str) -> str:
     parts = key.split("/")
-    return parts[4] if len(parts) > 4 and parts[3] == "vehicle" else ""
+    return parts[4] if len(parts) > 4 and parts[3] == kind else ""

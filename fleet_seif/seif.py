@@ -7,6 +7,7 @@
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -14,7 +15,7 @@ import scipy.sparse
 from fleet_seif import seif_step as kernels
 from fleet_seif.config import FilterSettings
 from fleet_seif.errors import NumericalError, ReadingRefused
-from fleet_seif.information import QUANTA_MAX, FrameDelta
+from fleet_seif.information import H_QUANTUM, QUANTA_MAX, FrameDelta
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Ints, Reading, Sightings
 
@@ -101,14 +102,21 @@ class Seif:
         numbers, new = self._numbers(signature, first_new)
         self._reserve(len(new), len(numbers))
         settings = self.settings
+        most = settings.step_information_max + (0.0 if moves else settings.start_information)
         code, statistics, *delta = kernels.seif_step(
             self._s, self.model, moves, u, cov, numbers, z, Z,
-            settings.active_max, settings.relax_others, settings.gate, settings.gate_patience,
+            settings.active_max, settings.relax_others, settings.gate, settings.gate_patience, int(most / H_QUANTUM),
         )  # fmt: skip
         if code in _FAULTS:
             raise ReadingRefused(f"reading refused: {_FAULTS[code]}; u={u.tolist()} z={seen.z.tolist()}")
         if code == kernels.NOT_POSITIVE_DEFINITE:
             raise NumericalError("the filter's local information matrix is not positive definite: reading refused")
+        if code == kernels.ABSURD:
+            raise ReadingRefused(
+                "reading refused: it claims more information than step_information_max, "
+                f"{settings.step_information_max:g} per m^2 or rad^2: its sightings are too sharp or too close; "
+                "raise the limit in [filter] if they are not"
+            )
         if code == kernels.TOO_LARGE:
             raise ReadingRefused(
                 f"reading refused: a sum would exceed {QUANTA_MAX // 2} quanta (H 2^-28, b 2^-24); a sighting claims"
@@ -164,6 +172,22 @@ class Seif:
         """The sum of all deltas so far, as one."""
         variables, rows, cols, H, b = kernels.published_total(self._s)
         return FrameDelta(variables=variables, rows=rows, cols=cols, H=H, b=b)
+
+    def state(self) -> dict[str, Any]:
+        """All that the filter knows, as plain values for msgpack; `restore` takes it back."""
+        arrays = {name: (array.shape, array.tobytes()) for name, array in self._s._asdict().items()}
+        return {"arrays": arrays, "signatures": self.signatures}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on where `state` was taken, to the bit. Raises ValueError where it is not the state of a filter."""
+        empty = _allocate(landmarks=1, neighbours=1, links=1, active=1)
+        arrays = {}
+        for name, like in empty._asdict().items():
+            shape, data = state["arrays"][name]
+            arrays[name] = np.frombuffer(data, like.dtype).reshape(shape).copy()
+        self._s = kernels.SeifArrays(**arrays)
+        self.signatures = list(state["signatures"])
+        self._number = {signature: number for number, signature in enumerate(self.signatures)}
 
     def information(self) -> tuple[scipy.sparse.csr_array, Floats]:
         """The filter's own H (n, n) and b (n,): pose first, then landmarks by number. For tests and inspection."""

@@ -38,6 +38,7 @@ BAD_SIGHTING_COV: Final = 3
 NOT_POSITIVE_DEFINITE: Final = 4
 TOO_LARGE: Final = 5
 BAD_RANGE: Final = 6
+ABSURD: Final = 7
 
 
 class SeifArrays(NamedTuple):
@@ -425,11 +426,12 @@ def accept_sightings(
 @kernel
 def seif_step(
     s: SeifArrays, model: int, moves: bool, u: Floats, cov: Floats, sighted: Ints, z: Floats, Z: Floats,
-    active_max: int, others: int, gate: float, patience: int,
+    active_max: int, others: int, gate: float, patience: int, growth_max: int,
 ) -> tuple[int, Floats, Ints, Ints, Ints, Ints, Ints]:  # fmt: skip
     """One step: motion (if `moves`), sightings of landmarks `sighted`, mean recovery, sparsification, delta.
 
-    Landmark numbers from counts[LANDMARKS] on are new; capacities must suffice.
+    Landmark numbers from counts[LANDMARKS] on are new; capacities must suffice. growth_max: quanta by which a diagonal
+    entry of H may grow at most.
 
     Returns: a code (OK ...), statistics (sum of squared innovations, sightings they come from, sightings refused), and
     the arrays of the FrameDelta.
@@ -470,6 +472,9 @@ def seif_step(
     if not fits:
         return TOO_LARGE, statistics, none, none, none, none, none
     old_H, old_b = published(s, ids, links)
+    for i in range(len(q_H)):
+        if q_H[i, i] - old_H[i, i] > growth_max:
+            return ABSURD, statistics, none, none, none, none, none
     for i in range(m):
         if ids[i] >= known:
             s.degree[ids[i]] = 0

@@ -1,19 +1,58 @@
-"""What vehicles and fusion nodes must agree on about a stream of messages: its prefix digest, and coalescing."""
+"""What vehicles and fusion nodes must agree on about a stream of messages: its prefix digest, where it is checked, what
+contradicts what, and coalescing."""
 
 import dataclasses
 import hashlib
-from typing import Final
+from typing import Final, NamedTuple
 
 from fleet_seif.information import FrameDelta, FrameTotal
-from fleet_seif.messages import DeltaMessage, FramePart, FrameStatus
+from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus
 from fleet_seif.records import Floats
 
 EMPTY_PREFIX: Final = bytes(32)
+CHECK_EVERY: Final = 64
 
 
 def extend_prefix(prefix: bytes, digest: bytes) -> bytes:
     """Digest of a stream's prefix after one more message: blake2b-256(prefix digest, body digest)."""
     return hashlib.blake2b(prefix + digest, digest_size=32).digest()
+
+
+def is_check_point(message: DeltaMessage) -> bool:
+    """Whether positive definiteness is checked after this message: its range contains a multiple of CHECK_EVERY, or it
+    ends or corrects a frame, or the stream."""
+    if message.last // CHECK_EVERY * CHECK_EVERY >= message.first or message.end:
+        return True
+    return any(part.end_pose is not None for part in message.parts)
+
+
+class Stop(NamedTuple):
+    """An epoch whose messages from `sequence` on count for nothing, because its vehicle contradicts itself."""
+
+    vehicle: str
+    epoch: Epoch
+    sequence: int
+
+
+def contradiction(a: DeltaMessage, b: DeltaMessage) -> Stop | None:
+    """Where two messages of one vehicle, whose bodies differ, cannot both belong to one history; None if they can.
+
+    Two messages of one epoch whose ranges overlap; two epochs that continue the same one; a message of an epoch beyond
+    the point from which another epoch continues it.
+    """
+    if a.vehicle != b.vehicle:
+        return None
+    if a.epoch == b.epoch:
+        overlap = a.first <= b.last and b.first <= a.last
+        return Stop(a.vehicle, a.epoch, min(a.first, b.first)) if overlap else None
+    of_a = None if a.hello is None else a.hello.continues
+    of_b = None if b.hello is None else b.hello.continues
+    if of_a is not None and of_b is not None and of_a.epoch == of_b.epoch:
+        return Stop(a.vehicle, of_a.epoch, min(of_a.last, of_b.last) + 1)
+    for continues, other in ((of_a, b), (of_b, a)):
+        if continues is not None and continues.epoch == other.epoch and other.last > continues.last:
+            return Stop(a.vehicle, other.epoch, min(other.first, continues.last + 1))
+    return None
 
 
 class Coalescer:

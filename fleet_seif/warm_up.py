@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from fleet_seif.config import FilterSettings
-from fleet_seif.information import FrameTotal, to_information
+from fleet_seif.definite import is_positive_definite
+from fleet_seif.information import FrameTotal, largest_growth, to_information
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello
 from fleet_seif.records import Reading, Sightings
 from fleet_seif.seif import Seif
@@ -38,11 +39,13 @@ def warm_up(say: Callable[[str], None] = lambda text: None) -> float:
     for delta in (seif.start(seen).delta, seif.step(motion).delta):
         total.add(delta)
     to_information(total.delta())
+    is_positive_definite(total.delta())
+    largest_growth(total.delta())
     seif.published()
     part = FramePart(frame=0, status=FrameStatus.OPENED, delta=total.delta())
     hello = Hello(
         software="", life=0, placed=True, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)),
-        sighting_information_max=1.0, sightings_max=1,
+        start_information=1.0, step_information_max=1.0,
     )  # fmt: skip
     message = DeltaMessage(
         fleet="f", vehicle="v", epoch=Epoch(0, 0), first=0, last=0, step=0, time_s=0.0, parts=(part,), hello=hello

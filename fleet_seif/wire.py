@@ -7,7 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.envelope import (
+    DELTA_MAX,
     ENTRIES_MAX,
     KIND_ACK,
     KIND_DELTA,
@@ -15,8 +17,8 @@ from fleet_seif.envelope import (
     KIND_RANGE,
     KIND_SNAPSHOT,
     PARTS_MAX,
+    REPLIES_MAX,
     SEQUENCE_MAX,
-    STEP_MAX,
     array_of,
     bool_of,
     digest_of,
@@ -32,8 +34,7 @@ from fleet_seif.envelope import (
     unseal,
 )
 from fleet_seif.errors import WireError
-from fleet_seif.information import QUANTA_MAX, VARIABLE_MAX, FrameDelta, block_size, row_offsets
-from fleet_seif.jit import kernel
+from fleet_seif.information import VARIABLE_MAX
 from fleet_seif.messages import (
     Ack,
     Continues,
@@ -45,73 +46,31 @@ from fleet_seif.messages import (
     RangeRequest,
     Snapshot,
 )
-from fleet_seif.records import Floats, Ints
-from fleet_seif.varints import decode_ints, encode_ints
+from fleet_seif.records import Floats
+from fleet_seif.signing import Signer
 
+STATUSES: Final = tuple(FrameStatus)
 CORRELATION_MARGIN: Final = 1e-9
 """Least eigenvalue of a start pose's correlation matrix."""
-
-
-@kernel
-def _values_needed(variables: Ints, rows: Ints, cols: Ints) -> int:
-    total = 0
-    for k in range(len(rows)):
-        total += block_size(variables[rows[k]], variables[cols[k]])
-    return total
-
-
-def _pack_delta(delta: FrameDelta) -> tuple[bytes, bytes, bytes, bytes]:
-    places = delta.rows * len(delta.variables) + delta.cols
-    return (
-        encode_ints(np.diff(delta.variables, prepend=0)),
-        encode_ints(np.diff(places, prepend=0)),
-        encode_ints(delta.H),
-        encode_ints(delta.b),
-    )
-
-
-def _read_delta(value: Any) -> FrameDelta:
-    columns = []
-    for name, data in zip(("variables", "blocks", "H", "b"), fields_of(value, 4, "delta"), strict=True):
-        numbers = decode_ints(data) if type(data) is bytes else None
-        if numbers is None:
-            raise WireError(f"delta {name}: expected integers")
-        if len(numbers) > ENTRIES_MAX:
-            raise WireError(f"delta {name}: {len(numbers)} entries, at most {ENTRIES_MAX}")
-        columns.append(numbers)
-    steps, place_steps, H, b = columns
-    for name, numbers in (("variables", steps), ("blocks", place_steps)):
-        if len(numbers) and (numbers[0] < 0 or np.any(numbers[1:] <= 0) or np.any(numbers > STEP_MAX)):
-            raise WireError(f"delta {name}: not ascending")
-    variables, places = np.cumsum(steps), np.cumsum(place_steps)
-    if len(variables) and variables[-1] > VARIABLE_MAX:
-        raise WireError(f"delta: variable {variables[-1]}, at most {VARIABLE_MAX}")
-    rows, cols = np.divmod(places, max(len(variables), 1))
-    if len(places) and (places[-1] >= len(variables) ** 2 or places[0] < 0 or np.any(rows > cols)):
-        raise WireError("delta: a block outside the upper triangle")
-    if len(H) != _values_needed(variables, rows, cols) or len(b) != row_offsets(variables)[-1]:
-        raise WireError("delta: number of values does not fit the blocks")
-    for numbers in (H, b):
-        if len(numbers) and not -QUANTA_MAX < numbers.min() <= numbers.max() < QUANTA_MAX:
-            raise WireError("delta: a value reaches 2^60 quanta")
-    return FrameDelta(variables=variables, rows=rows, cols=cols, H=H, b=b)
+INFORMATION_MAX: Final = 1e9
+"""Most information that a vehicle may declare for a frame's first pose or for a step, per m^2 or rad^2."""
 
 
 def _pack_part(part: FramePart) -> tuple[object, ...]:
     end = None if part.end_pose is None else raw_bytes(part.end_pose)
-    return part.frame, int(part.status), _pack_delta(part.delta), end
+    return part.frame, int(part.status), pack_delta(part.delta), end
 
 
 def _read_part(value: Any) -> FramePart:
     frame, status, delta, end = fields_of(value, 4, "frame part")
-    status = FrameStatus(int_of(status, 0, 3, "frame status"))
+    status = STATUSES[int_of(status, 0, 3, "frame status")]
     ends = status in (FrameStatus.ENDED, FrameStatus.CORRECTED)
     if ends != (end is not None):
         raise WireError("frame part: an end pose belongs to frames that ended or are corrected, and only to those")
     return FramePart(
         frame=int_of(frame, 0, VARIABLE_MAX, "frame number"),
         status=status,
-        delta=_read_delta(delta),
+        delta=read_delta(delta),
         end_pose=array_of(end, (3,), "end pose") if ends else None,
     )
 
@@ -124,8 +83,8 @@ def _pack_hello(hello: Hello) -> tuple[object, ...]:
         hello.placed,
         raw_bytes(hello.start_pose),
         raw_bytes(hello.start_pose_cov),
-        hello.sighting_information_max,
-        hello.sightings_max,
+        hello.start_information,
+        hello.step_information_max,
         None if c is None else (tuple(c.epoch), c.last, c.prefix_digest),
     )
 
@@ -139,7 +98,7 @@ def is_start_covariance(cov: Floats) -> bool:
 
 
 def _read_hello(value: Any) -> Hello:
-    software, life, placed, pose, cov, information, sightings, continues = fields_of(value, 8, "hello")
+    software, life, placed, pose, cov, start, step, continues = fields_of(value, 8, "hello")
     if continues is not None:
         epoch, last, digest = fields_of(continues, 3, "continues")
         continues = Continues(
@@ -147,9 +106,6 @@ def _read_hello(value: Any) -> Hello:
             last=int_of(last, 0, SEQUENCE_MAX, "continues"),
             prefix_digest=digest_of(digest, "prefix"),
         )
-    information_max = float_of(information, "sighting information")
-    if not information_max > 0:
-        raise WireError("sighting information: expected a positive number")
     start_pose_cov = array_of(cov, (3, 3), "start pose covariance")
     if np.any(start_pose_cov) and not is_start_covariance(start_pose_cov):
         raise WireError("start pose covariance: neither zeros nor symmetric and positive definite")
@@ -159,10 +115,16 @@ def _read_hello(value: Any) -> Hello:
         placed=bool_of(placed, "placed"),
         start_pose=array_of(pose, (3,), "start pose"),
         start_pose_cov=start_pose_cov,
-        sighting_information_max=information_max,
-        sightings_max=int_of(sightings, 1, ENTRIES_MAX, "sightings"),
+        start_information=_information_of(start, "start information"),
+        step_information_max=_information_of(step, "information a step"),
         continues=continues,
     )
+
+
+def _information_of(value: Any, what: str) -> float:
+    if not 0 < float_of(value, what) <= INFORMATION_MAX:
+        raise WireError(f"{what}: expected a number above 0, at most {INFORMATION_MAX:g}")
+    return float(value)
 
 
 def _pack_message(m: DeltaMessage) -> tuple[object, ...]:
@@ -223,76 +185,96 @@ def _read_alias(value: Any) -> tuple[int, int, bool]:
     return int_of(a, 0, limit, "alias"), int_of(b, 0, limit, "alias"), bool_of(added, "alias")
 
 
-def encode_message(message: DeltaMessage) -> bytes:
-    """Bytes of a DeltaMessage."""
-    return seal(KIND_DELTA, _pack_message(message))
+def encode_message(message: DeltaMessage, signer: Signer | None = None) -> bytes:
+    """Bytes of a DeltaMessage. Raises ValueError where they would be more than DELTA_MAX."""
+    data = seal(KIND_DELTA, _pack_message(message), signer)
+    if len(data) > DELTA_MAX:
+        raise ValueError(f"message {message.first} has {len(data)} bytes, at most {DELTA_MAX} may be sent")
+    return data
 
 
 def decode_message(data: bytes) -> DeltaMessage:
     """A DeltaMessage from bytes. Raises WireError."""
+    if len(data) > DELTA_MAX:
+        raise WireError(f"delta message of {len(data)} bytes: at most {DELTA_MAX}")
     return _read_message(unseal(KIND_DELTA, data))
 
 
-def encode_snapshot(snapshot: Snapshot) -> bytes:
+def encode_snapshot(snapshot: Snapshot, signer: Signer | None = None) -> bytes:
     """Bytes of a Snapshot."""
-    return seal(KIND_SNAPSHOT, (_pack_message(snapshot.message), snapshot.prefix_digest))
+    fields = (_pack_message(snapshot.message), snapshot.prefix_digest, snapshot.maker or None)
+    return seal(KIND_SNAPSHOT, fields, signer)
 
 
 def decode_snapshot(data: bytes) -> Snapshot:
     """A Snapshot from bytes. Raises WireError."""
-    message, digest = fields_of(unseal(KIND_SNAPSHOT, data), 2, "snapshot")
-    snapshot = Snapshot(message=_read_message(message), prefix_digest=digest_of(digest, "prefix digest"))
+    message, digest, maker = fields_of(unseal(KIND_SNAPSHOT, data), 3, "snapshot")
+    snapshot = Snapshot(
+        message=_read_message(message),
+        prefix_digest=digest_of(digest, "prefix digest"),
+        maker="" if maker is None else name_of(maker, "maker"),
+    )
     if snapshot.message.first != 0:
         raise WireError("snapshot: does not start at sequence 0")
     return snapshot
 
 
-def encode_heartbeat(h: Heartbeat) -> bytes:
+def encode_heartbeat(h: Heartbeat, signer: Signer | None = None) -> bytes:
     """Bytes of a Heartbeat."""
-    return seal(KIND_HEARTBEAT, (h.vehicle, tuple(h.epoch), h.last, h.prefix_digest, h.ended))
+    fields = (h.fleet, h.vehicle, tuple(h.epoch), h.last, h.prefix_digest, h.checked, h.checked_digest, h.ended)
+    return seal(KIND_HEARTBEAT, fields, signer)
 
 
 def decode_heartbeat(data: bytes) -> Heartbeat:
     """A Heartbeat from bytes. Raises WireError."""
-    vehicle, epoch, last, digest, ended = fields_of(unseal(KIND_HEARTBEAT, data), 5, "heartbeat")
+    fields = fields_of(unseal(KIND_HEARTBEAT, data), 8, "heartbeat")
+    fleet, vehicle, epoch, last, digest, checked, checked_digest, ended = fields
+    last = int_of(last, 0, SEQUENCE_MAX, "last")
     return Heartbeat(
+        fleet=name_of(fleet, "fleet"),
         vehicle=name_of(vehicle, "vehicle"),
         epoch=epoch_of(epoch),
-        last=int_of(last, 0, SEQUENCE_MAX, "last"),
+        last=last,
         prefix_digest=digest_of(digest, "prefix digest"),
+        checked=int_of(checked, -1, last, "checked"),
+        checked_digest=digest_of(checked_digest, "checked digest"),
         ended=bool_of(ended, "ended"),
     )
 
 
-def encode_ack(a: Ack) -> bytes:
+def encode_ack(a: Ack, signer: Signer | None = None) -> bytes:
     """Bytes of an Ack."""
-    return seal(KIND_ACK, (a.node, a.vehicle, tuple(a.epoch), a.last, a.prefix_digest))
+    return seal(KIND_ACK, (a.fleet, a.node, a.vehicle, tuple(a.epoch), a.last, a.prefix_digest, a.fault), signer)
 
 
 def decode_ack(data: bytes) -> Ack:
     """An Ack from bytes. Raises WireError."""
-    node, vehicle, epoch, last, digest = fields_of(unseal(KIND_ACK, data), 5, "ack")
+    fleet, node, vehicle, epoch, last, digest, fault = fields_of(unseal(KIND_ACK, data), 7, "ack")
     return Ack(
+        fleet=name_of(fleet, "fleet"),
         node=name_of(node, "node"),
         vehicle=name_of(vehicle, "vehicle"),
         epoch=epoch_of(epoch),
         last=int_of(last, 0, SEQUENCE_MAX, "last"),
         prefix_digest=digest_of(digest, "prefix digest"),
+        fault=text_of(fault, "fault"),
     )
 
 
-def encode_range(r: RangeRequest) -> bytes:
+def encode_range(r: RangeRequest, signer: Signer | None = None) -> bytes:
     """Bytes of a RangeRequest."""
-    return seal(KIND_RANGE, (tuple(r.epoch), r.first, r.last, r.count))
+    return seal(KIND_RANGE, (r.fleet, r.vehicle, tuple(r.epoch), r.first, r.last, r.count), signer)
 
 
 def decode_range(data: bytes) -> RangeRequest:
     """A RangeRequest from bytes. Raises WireError."""
-    epoch, first, last, count = fields_of(unseal(KIND_RANGE, data), 4, "range")
+    fleet, vehicle, epoch, first, last, count = fields_of(unseal(KIND_RANGE, data), 6, "range")
     first = int_of(first, 0, SEQUENCE_MAX, "first")
     return RangeRequest(
+        fleet=name_of(fleet, "fleet"),
+        vehicle=name_of(vehicle, "vehicle"),
         epoch=epoch_of(epoch),
         first=first,
         last=int_of(last, first, SEQUENCE_MAX, "last"),
-        count=int_of(count, 1, 4096, "count"),
+        count=int_of(count, 1, REPLIES_MAX, "count"),
     )

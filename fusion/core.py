@@ -1,24 +1,34 @@
 """What a fusion node does, without I/O: bytes and time in, effects out.
 
 1. Every message goes to the ledger; what it says decides about acknowledgements and repairs.
-2. A gap is known from a parked message or a heartbeat. It is asked for after `repair_after_s`; without progress the
-   wait doubles up to `repair_max_s`. One query a stream at a time, which counts as lost after `QUERY_LOST_S`.
-3. Acknowledgements go out every `ack_every` messages or `ack_s`, and again with every heartbeat.
-4. Times are this node's own monotonic clock; nothing compares them with another's.
+2. Effects say "we hold this": whoever carries them out commits `ledger.take_changes()` to the store first.
+3. A gap is known from a parked message, a heartbeat or the status of another node. It is asked for after
+   `repair_after_s`; without progress the wait doubles up to `repair_max_s`, and vehicle and other nodes are asked in
+   turn. One query a stream at a time, `queries_max` in all; a query counts as lost after `QUERY_LOST_S`.
+4. Acknowledgements go out every `ack_every` messages or `ack_s`, and again with every heartbeat.
+5. Nodes tell each other how far they are every `status_s`; evidence and decisions of operators are fetched if unknown.
+6. Times are this node's own monotonic clock; nothing compares them with another's.
 """
 
 import logging
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fleet_seif.config import FusionSettings
+from fleet_seif.envelope import KIND_EVENT, KIND_HEARTBEAT, authenticate, kind_of
 from fleet_seif.errors import WireError
-from fleet_seif.messages import Ack, Epoch, RangeRequest, VehicleState
-from fleet_seif.wire import decode_heartbeat, encode_ack, encode_range
-from fusion.ledger import Ledger, Receipt, Stream
+from fleet_seif.messages import Ack, Epoch, NodeStatus, RangeRequest, StreamPosition, VehicleState
+from fleet_seif.node_wire import decode_status, encode_status
+from fleet_seif.signing import KeyRing, Role, Signer
+from fleet_seif.wire import decode_heartbeat, decode_range, encode_ack, encode_range
+from fusion.compaction import compact
+from fusion.ledger import Ledger, Receipt
+from fusion.stream import Stream
 
 log = logging.getLogger(__name__)
 QUERY_LOST_S = 4.0
+REPLY_BYTES_MAX = 4 * 2**20
+ANNOUNCED_MAX = 8
 
 
 @dataclass(frozen=True)
@@ -31,49 +41,94 @@ class PutAck:
 
 @dataclass(frozen=True)
 class AskRange:
-    """Query a vehicle's outbox; feed replies to `on_reply` and the end to `on_reply_done`."""
+    """Query a vehicle's outbox, or the ledgers of the other nodes; replies go to `on_reply`, the end to
+    `on_reply_done`."""
 
     vehicle: str
     epoch: Epoch
     data: bytes
+    nodes: bool = False
 
 
-Effect = PutAck | AskRange
+@dataclass(frozen=True)
+class PutStatus:
+    """Tell the other nodes how far this one is."""
+
+    data: bytes
+
+
+@dataclass(frozen=True)
+class AskEvents:
+    """Query another node's events and evidence; replies go to `on_events`."""
+
+    node: str
+
+
+Effect = PutAck | AskRange | PutStatus | AskEvents
 
 
 @dataclass
 class Link:
-    """What the node knows of one stream beside the ledger. Times in s."""
+    """What the node knows of one stream beside the ledger. Times in s.
+
+    announced: last number that its vehicle says it has put; elsewhere: last number that another node holds.
+    """
 
     announced: int = -1
+    elsewhere: int = -1
     heard_s: float = 0.0
     acked: int = -1
     ack_due_s: float | None = None
     gap_since_s: float | None = None
     wait_s: float = 0.0
     asking_until_s: float | None = None
+    ask_nodes: bool = False
     next_at_ask: int = 0
     repaired: int = 0
+
+
+@dataclass
+class Peer:
+    """Another fusion node: when it was heard, and how far it is with each stream."""
+
+    heard_s: float
+    last: dict[tuple[str, Epoch], int] = field(default_factory=dict)
 
 
 class FusionCore:
     """See the rules above. `expected`: vehicles whose streams must end before the run is complete; 0 never ends."""
 
-    def __init__(self, fleet: str, node: str, settings: FusionSettings, expected: int = 0) -> None:
-        self.ledger = Ledger(fleet, settings.parked_max)
+    def __init__(
+        self,
+        fleet: str,
+        node: str,
+        settings: FusionSettings,
+        expected: int = 0,
+        *,
+        keys: KeyRing | None = None,
+        signer: Signer | None = None,
+    ) -> None:
+        self.ledger = Ledger(fleet, settings, keys)
         self.counters: Counter[str] = Counter()
         self.changed = False
         self.node = node
+        self._keys = keys
+        self._signer = signer
         self._settings = settings
         self._expected = expected
         self._links: dict[tuple[str, Epoch], Link] = {}
+        self._peers: dict[str, Peer] = {}
+        self._status_due_s = 0.0
+        self._compact_at = settings.compact_bytes
 
     def on_delta(self, vehicle: str, data: bytes, now_s: float) -> list[Effect]:
         """A message that a vehicle put."""
         return self._take(vehicle, data, now_s, repair=False)
 
     def on_reply(self, vehicle: str, data: bytes, now_s: float) -> list[Effect]:
-        """A message that came as an answer to a range query."""
+        """A message that came as an answer to a range query; a heartbeat comes before another node's snapshot."""
+        if kind_of(data) == KIND_HEARTBEAT:
+            return self.on_heartbeat(vehicle, data, now_s)
         return self._take(vehicle, data, now_s, repair=True)
 
     def _take(self, vehicle: str, data: bytes, now_s: float, *, repair: bool) -> list[Effect]:
@@ -81,41 +136,112 @@ class FusionCore:
             receipt, stream = self.ledger.accept(data, vehicle)
         except WireError as error:
             return self._malformed(vehicle, error)
-        if receipt is Receipt.REFUSED:
-            log.warning("message_refused vehicle=%s next=%d fault=%s", vehicle, stream.next, stream.fault)
         link = self._link(stream)
         link.heard_s = now_s
         if receipt is Receipt.FOLDED:
             self.changed = True
             link.repaired += repair
             link.gap_since_s, link.wait_s = None, self._settings.repair_after_s
-        newest = max(stream.parked, default=-1)
-        link.announced = max(link.announced, stream.next - 1, newest)
+        elif receipt in (Receipt.REFUSED, Receipt.DROPPED):
+            self.changed = True
+            reason = stream.quarantine or "beyond a limit, or not what is held"
+            self._count(f"messages_{receipt.name.lower()}", vehicle, reason)
         return self._acknowledge(stream, link, now_s) + self._repair(stream, link, now_s)
 
     def on_heartbeat(self, vehicle: str, data: bytes, now_s: float) -> list[Effect]:
         """A heartbeat."""
         try:
+            authenticate(data, self._keys, Role.VEHICLE, vehicle)
             heartbeat = decode_heartbeat(data)
-            if heartbeat.vehicle != vehicle:
-                raise WireError(f"heartbeat of {heartbeat.vehicle!r} under the key of {vehicle!r}")
+            if (heartbeat.fleet, heartbeat.vehicle) != (self.ledger.fleet, vehicle):
+                raise WireError(
+                    f"heartbeat of {heartbeat.vehicle!r} of {heartbeat.fleet!r} under the key of {vehicle!r}"
+                )
             stream = self.ledger.stream(vehicle, heartbeat.epoch)
         except WireError as error:
             return self._malformed(vehicle, error)
         link = self._link(stream)
         link.heard_s = now_s
-        link.announced = max(link.announced, heartbeat.last)
-        if heartbeat.last == stream.next - 1 and heartbeat.prefix_digest != stream.prefix_digest:
-            self.counters["forks"] += 1
-            log.error("stream_forked vehicle=%s last=%d: it says that it sent something else", vehicle, heartbeat.last)
+        link.announced = heartbeat.last
+        stream.announced[heartbeat.checked] = heartbeat.checked_digest
+        stream.announced[heartbeat.last] = heartbeat.prefix_digest
+        while len(stream.announced) > ANNOUNCED_MAX:
+            del stream.announced[next(iter(stream.announced))]
+        held = stream.check_digests.get(heartbeat.checked)
+        if held == heartbeat.checked_digest:
+            self.ledger.keep_witness(stream, heartbeat.checked, data)
+        forked = heartbeat.last == stream.next - 1 and heartbeat.prefix_digest != stream.prefix_digest
+        if forked or held not in (None, heartbeat.checked_digest):
+            self._count("forks", vehicle, f"it says that it sent something else up to {heartbeat.last}")
         if stream.next > 0:
             link.ack_due_s = now_s  # an acknowledgement may have been lost: repeat it
         return self._acknowledge(stream, link, now_s) + self._repair(stream, link, now_s)
 
-    def _malformed(self, vehicle: str, error: WireError) -> list[Effect]:
-        self.counters["malformed"] += 1
-        log.warning("malformed vehicle=%s reason=%s", vehicle, error)
+    def on_status(self, node: str, data: bytes, now_s: float) -> list[Effect]:
+        """How far another node is."""
+        if node == self.node:
+            return []
+        try:
+            authenticate(data, self._keys, Role.NODE, node)
+            status = decode_status(data)
+            if (status.fleet, status.node) != (self.ledger.fleet, node):
+                raise WireError(f"status of {status.node!r} of {status.fleet!r} under the key of {node!r}")
+            streams = [(self.ledger.stream(p.vehicle, p.epoch), p) for p in status.streams]
+        except WireError as error:
+            return self._malformed(node, error)
+        self._peers[node] = Peer(now_s, {(p.vehicle, p.epoch): p.last for p in status.streams})
+        effects: list[Effect] = []
+        ask = any(key not in self.ledger.events for key in status.events)
+        for stream, position in streams:
+            link = self._link(stream)
+            link.elsewhere = max(link.elsewhere, position.last)
+            ask = ask or position.evidence not in (b"", stream.evidence_id)
+            effects += self._repair(stream, link, now_s)
+        return [*effects, AskEvents(node)] if ask else effects
+
+    def on_events(self, node: str, data: bytes) -> list[Effect]:
+        """One event or one piece of evidence of another node."""
+        try:
+            news = self.ledger.accept_event(data) if kind_of(data) == KIND_EVENT else self.ledger.accept_evidence(data)
+        except WireError as error:
+            return self._malformed(node, error)
+        self.changed = self.changed or news
         return []
+
+    def answer_events(self) -> list[bytes]:
+        """All decisions of operators and all evidence, for another node."""
+        return [*self.ledger.events.values(), *(s.evidence for s in self.ledger.streams.values() if s.evidence)]
+
+    def answer_range(self, vehicle: str, data: bytes) -> list[bytes]:
+        """Messages of a vehicle for another node; a snapshot comes after the heartbeat that vouches for its digest."""
+        try:
+            request = decode_range(data)
+        except WireError as error:
+            self._malformed(vehicle, error)
+            return []
+        stream = self.ledger.streams.get((vehicle, request.epoch))
+        if stream is None or (request.fleet, request.vehicle) != (self.ledger.fleet, vehicle):
+            return []
+        found: list[bytes] = [stream.witness] if stream.witness and stream.snapshot_covers(request.first) else []
+        size = 0
+        first = request.first
+        while first < stream.next and first <= request.last and len(found) < request.count and size < REPLY_BYTES_MAX:
+            at = stream.index_of(first)
+            found.append(stream.log[at])
+            size += len(stream.log[at])
+            first = stream.firsts[at + 1] if at + 1 < len(stream.log) else stream.next
+        return found
+
+    def _malformed(self, who: str, error: WireError) -> list[Effect]:
+        self._count("malformed", who, str(error))
+        return []
+
+    def _count(self, what: str, who: str, reason: str) -> None:
+        """Count, and log the 1st, 2nd, 4th, 8th ... time: a flood must not fill the log."""
+        self.counters[what] += 1
+        count = self.counters[what]
+        if count & (count - 1) == 0:
+            log.warning("%s count=%d from=%s reason=%s", what, count, who, reason)
 
     def on_reply_done(self, vehicle: str, epoch: Epoch, now_s: float) -> list[Effect]:
         """A range query is over: ask on at once after progress, later without."""
@@ -123,9 +249,12 @@ class FusionCore:
         link = self._link(stream)
         link.asking_until_s = None
         link.gap_since_s = now_s
-        progress = stream.next > link.next_at_ask
         settings = self._settings
-        link.wait_s = 0.0 if progress else min(max(2 * link.wait_s, settings.repair_after_s), settings.repair_max_s)
+        if stream.next > link.next_at_ask:
+            link.wait_s = 0.0
+        else:
+            link.ask_nodes = not link.ask_nodes
+            link.wait_s = min(max(2 * link.wait_s, settings.repair_after_s), settings.repair_max_s)
         return self._repair(stream, link, now_s)
 
     def tick(self, now_s: float) -> list[Effect]:
@@ -136,10 +265,38 @@ class FusionCore:
             if link.ack_due_s is not None and now_s >= link.ack_due_s:
                 effects += self._acknowledge(stream, link, now_s)
             effects += self._repair(stream, link, now_s)
+        if now_s >= self._status_due_s:
+            self._status_due_s = now_s + self._settings.status_s
+            effects.append(PutStatus(encode_status(self.status(), self._signer)))
+        if self.ledger.bytes > self._compact_at:
+            self.compact()
         return effects
 
+    def status(self) -> NodeStatus:
+        """How far this node is."""
+        streams = [s for s in self.ledger.streams.values() if s.next > 0 or s.evidence]
+        return NodeStatus(
+            fleet=self.ledger.fleet,
+            node=self.node,
+            streams=tuple(
+                StreamPosition(s.vehicle, s.epoch, s.next - 1, s.prefix_digest, s.evidence_id) for s in streams
+            ),
+            events=tuple(self.ledger.events),
+        )
+
+    def compact(self) -> int:
+        """Replace prefixes by snapshots where that is safe; returns the bytes saved. See `compaction`."""
+        before = self.ledger.bytes
+        required = [name for name in self._settings.required_acks if name != self.node]
+        for key, stream in self.ledger.streams.items():
+            held = [self._peers[name].last.get(key, -1) if name in self._peers else -1 for name in required]
+            self.ledger.replace(stream, compact(stream, min([stream.checked, *held]), self.node, self._signer))
+        self._compact_at = max(self._settings.compact_bytes, 2 * self.ledger.bytes)
+        log.info("ledger_compacted before=%d after=%d", before, self.ledger.bytes)
+        return before - self.ledger.bytes
+
     def _link(self, stream: Stream) -> Link:
-        return self._links.setdefault((stream.vehicle, stream.epoch), Link(wait_s=self._settings.repair_after_s))
+        return self._links.setdefault(stream.key, Link(wait_s=self._settings.repair_after_s))
 
     def _acknowledge(self, stream: Stream, link: Link, now_s: float) -> list[Effect]:
         last = stream.next - 1
@@ -149,63 +306,86 @@ class FusionCore:
         if last < 0 or not (due or last - link.acked >= self._settings.ack_every):
             return []
         link.acked, link.ack_due_s = last, None
-        return [self.ack_now(stream.vehicle, stream.epoch)]
+        return [self.ack_now(stream)]
 
-    def ack_now(self, vehicle: str, epoch: Epoch) -> PutAck:
+    def ack_now(self, stream: Stream) -> PutAck:
         """The acknowledgement of all that is folded of a stream, whatever has been sent before."""
-        stream = self.ledger.stream(vehicle, epoch)
         ack = Ack(
+            fleet=self.ledger.fleet,
             node=self.node,
-            vehicle=vehicle,
-            epoch=epoch,
+            vehicle=stream.vehicle,
+            epoch=stream.epoch,
             last=max(stream.next - 1, 0),
             prefix_digest=stream.prefix_digest,
+            fault=stream.quarantine[:200],
         )
-        return PutAck(vehicle, encode_ack(ack))
+        return PutAck(stream.vehicle, encode_ack(ack, self._signer))
+
+    def _wanted(self, stream: Stream, link: Link) -> int:
+        """The last number that there is and that may still count, as far as is known."""
+        if stream.over:
+            return stream.next - 1
+        last = max(link.announced, link.elsewhere, max(stream.parked, default=-1))
+        return last if stream.stop is None else min(last, stream.stop - 1)
 
     def _repair(self, stream: Stream, link: Link, now_s: float) -> list[Effect]:
-        if link.announced < stream.next or stream.fault is not None:
+        wanted = self._wanted(stream, link)
+        if wanted < stream.next:
             link.gap_since_s = None
             return []
         if link.asking_until_s is not None and now_s < link.asking_until_s:
             return []
         if link.gap_since_s is None:
             link.gap_since_s = now_s
-        if now_s < link.gap_since_s + link.wait_s:
+        if now_s < link.gap_since_s + link.wait_s or stream.next in stream.parked:
+            return []  # not yet, or all it waits for is the epoch that it continues
+        asking = sum(each.asking_until_s is not None and now_s < each.asking_until_s for each in self._links.values())
+        if asking >= self._settings.queries_max:
             return []
-        last = min(stream.parked) - 1 if stream.parked else link.announced
+        last = min(stream.parked) - 1 if stream.parked else wanted
         link.asking_until_s, link.next_at_ask = now_s + QUERY_LOST_S, stream.next
         request = RangeRequest(
-            epoch=stream.epoch, first=stream.next, last=max(last, stream.next), count=self._settings.repair_batch
+            fleet=self.ledger.fleet,
+            vehicle=stream.vehicle,
+            epoch=stream.epoch,
+            first=stream.next,
+            last=max(last, stream.next),
+            count=self._settings.repair_batch,
         )
         self.counters["queries"] += 1
-        return [AskRange(stream.vehicle, stream.epoch, encode_range(request))]
+        nodes = bool(self._peers) and (link.ask_nodes or link.elsewhere > link.announced)
+        return [AskRange(stream.vehicle, stream.epoch, encode_range(request, self._signer), nodes)]
 
     def states(self, now_s: float) -> tuple[VehicleState, ...]:
         """Every stream that is known, by vehicle and epoch."""
-        placed = {(stream.vehicle, stream.epoch) for stream in self.ledger.placed()}
-        return tuple(self._state(key, link, now_s, key in placed) for key, link in sorted(self._links.items()))
+        placed = {(root.vehicle, id(root.life)) for root in self.ledger.placed()}
+        return tuple(self._state(key, link, now_s, placed) for key, link in sorted(self._links.items()))
 
-    def _state(self, key: tuple[str, Epoch], link: Link, now_s: float, placed: bool) -> VehicleState:
+    def _state(self, key: tuple[str, Epoch], link: Link, now_s: float, placed: set[tuple[str, int]]) -> VehicleState:
         stream = self.ledger.streams[key]
         return VehicleState(
             name=stream.vehicle,
-            life=stream.life,
+            life=stream.number,
             epoch=stream.epoch,
             cut=stream.next - 1,
-            behind=max(link.announced - stream.next + 1, 0),
+            checked=stream.checked,
+            behind=max(self._wanted(stream, link) - stream.next + 1, 0),
             parked=len(stream.parked),
             duplicates=stream.duplicates,
             gaps_repaired=link.repaired,
             refused=stream.refused,
-            placed=placed,
-            stalled=not stream.ended and now_s - link.heard_s > self._settings.stalled_s,
+            placed=(stream.vehicle, id(stream.life)) in placed,
+            stalled=not stream.over and now_s - link.heard_s > self._settings.stalled_s,
             ended=stream.ended,
-            healthy=stream.healthy and stream.fault is None,
+            healthy=stream.healthy and not stream.quarantine,
+            fault=stream.quarantine[:200],
         )
 
     @property
     def complete(self) -> bool:
-        """Whether every expected vehicle's stream has ended and is folded (or can go no further)."""
-        over = {stream.vehicle for stream in self.ledger.streams.values() if stream.ended or stream.fault is not None}
-        return 0 < self._expected <= len(over)
+        """Whether the newest epoch of every expected vehicle is over: ended and folded, or quarantined."""
+        newest: dict[str, Stream] = {}
+        for _, stream in sorted(self.ledger.streams.items()):
+            if stream.next > 0 or stream.parked:
+                newest[stream.vehicle] = stream
+        return 0 < self._expected <= sum(stream.over for stream in newest.values())

@@ -6,71 +6,75 @@ import numpy as np
 
 from fleet_seif.config import FusionSettings
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import Life, landmark_classes, marginal_covariances, solve
-from fleet_seif.messages import JointMap, VehicleState
+from fleet_seif.joint import Life, marginal_covariances, solve
+from fleet_seif.messages import JointMap, LandmarkName, VehicleState
 from fusion.core import FusionCore
-from fusion.ledger import Ledger
+
+Classes = tuple[tuple[LandmarkName, ...], ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MapInput:
-    """A copy of all that a map is made from."""
+    """A copy of all that a map is made from: what has been checked, and (None: the same) all that has been folded."""
 
     fleet: str
-    lives: tuple[Life, ...]
+    node: str
+    checked: tuple[Life, ...]
+    classes: Classes
+    live: tuple[Life, ...] | None
+    live_classes: Classes
     map_digest: bytes
     ledger_digest: bytes
     vehicles: tuple[VehicleState, ...]
     counters: dict[str, int]
 
 
-def lives_of(ledger: Ledger) -> tuple[Life, ...]:
-    """What the placed and healthy lives have contributed, in canonical order."""
-    return tuple(
-        Life(
-            vehicle=stream.vehicle,
-            life=stream.life,
-            start_pose=stream.hello.start_pose,
-            start_pose_cov=stream.hello.start_pose_cov,
-            frames=tuple(stream.frames[f].total.delta() for f in sorted(stream.frames)),
-            signatures=tuple(stream.signatures),
-        )
-        for stream in ledger.placed()
-        if stream.hello is not None
-    )
-
-
 def map_input(core: FusionCore, now_s: float) -> MapInput:
     """Copy what a map is made from; the caller keeps others off the core meanwhile."""
+    ledger = core.ledger
+    checked, live = ledger.lives(), ledger.lives(live=True)
+    same = all(a.frames == b.frames for a, b in zip(checked, live, strict=True))  # the very same arrays
     return MapInput(
-        fleet=core.ledger.fleet,
-        lives=lives_of(core.ledger),
-        map_digest=core.ledger.map_digest(),
-        ledger_digest=core.ledger.ledger_digest(),
+        fleet=ledger.fleet,
+        node=core.node,
+        checked=checked,
+        classes=ledger.classes(checked),
+        live=None if same else live,
+        live_classes=() if same else ledger.classes(live),
+        map_digest=ledger.map_digest(),
+        ledger_digest=ledger.ledger_digest(),
         vehicles=core.states(now_s),
         counters=dict(core.counters),
     )
 
 
 def make_map(taken: MapInput, version: int, settings: FusionSettings, *, final: bool) -> JointMap:
-    """Solve. With frames = "single" every map is a canonical one: assembled from nothing, in canonical order."""
-    lives = taken.lives
-    counters = dict(taken.counters)
-    try:
-        solution = solve(lives, landmark_classes(lives))
-    except NumericalError:
-        lives = tuple(life for life in lives if can_be_solved(life))  # one bad vehicle must not stop the map of all
-        counters["lives_left_out"] = len(taken.lives) - len(lives)
-        solution = solve(lives, landmark_classes(lives))
-    classes = solution.classes
-    newest = [i for i, (_, _, k) in enumerate(solution.poses) if k < 0]
+    """Solve: everything folded if that is positive definite, what has been checked otherwise and at the end."""
+    canonical = taken.live is None or final
+    if taken.live is not None and not final:
+        try:
+            return _solved(taken, taken.live, taken.live_classes, version, settings, final=False, canonical=False)
+        except NumericalError:
+            canonical = True
+    return _solved(taken, taken.checked, taken.classes, version, settings, final=final, canonical=canonical)
+
+
+def _solved(
+    taken: MapInput, lives: tuple[Life, ...], classes: Classes, version: int, settings: FusionSettings,
+    *, final: bool, canonical: bool,
+) -> JointMap:  # fmt: skip
+    solution = solve(lives, classes)
+    poses = solution.poses
+    newest = {vehicle: i for i, (vehicle, _, k) in enumerate(poses) if k < 0}  # of several lives, the last
+    rows = list(newest.values())
     with_cov = final or len(classes) <= settings.covariance_landmarks_max
     if with_cov:
         landmark_cov, pose_cov = marginal_covariances(solution)
     return JointMap(
         fleet=taken.fleet,
+        node=taken.node,
         version=version,
-        canonical=True,
+        canonical=canonical,
         final=final,
         map_digest=taken.map_digest,
         ledger_digest=taken.ledger_digest,
@@ -79,27 +83,19 @@ def make_map(taken: MapInput, version: int, settings: FusionSettings, *, final: 
         cov_version=version if with_cov else -1,
         names=classes,
         signature=solution.signatures,
-        poses=tuple(solution.poses[i][0] for i in newest),
-        pose_mean=solution.pose_mean[newest],
-        pose_cov=pose_cov[newest] if with_cov else np.empty((0, 3, 3)),
+        poses=tuple(newest),
+        pose_mean=solution.pose_mean[rows],
+        pose_cov=pose_cov[rows] if with_cov else np.empty((0, 3, 3)),
         vehicles=taken.vehicles,
-        counters=counters,
+        counters=taken.counters,
     )
 
 
-def can_be_solved(life: Life) -> bool:
-    """Whether what a life has contributed is a map on its own."""
-    try:
-        solve([life], landmark_classes([life]))
-    except NumericalError:
-        return False
-    return True
-
-
-def empty_map(fleet: str, version: int = -1) -> JointMap:
+def empty_map(fleet: str, node: str, version: int = -1) -> JointMap:
     """The map before anything is known."""
     return JointMap(
-        fleet=fleet, version=version, canonical=True, final=False, map_digest=bytes(32), ledger_digest=bytes(32),
+        fleet=fleet, node=node, version=version, canonical=True, final=False,
+        map_digest=bytes(32), ledger_digest=bytes(32),
         landmark_mean=np.empty((0, 2)), landmark_cov=np.empty((0, 2, 2)), cov_version=-1, names=(), signature=(),
         poses=(), pose_mean=np.empty((0, 3)), pose_cov=np.empty((0, 3, 3)), vehicles=(),
     )  # fmt: skip

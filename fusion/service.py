@@ -1,13 +1,14 @@
 """The fusion core in its shell: one thread folds, another solves and serves, and neither waits for the other.
 
-1. Zenoh's threads only put events into the inbox; above `INBOX_MAX` they are dropped, and repaired by query later.
-2. The solver takes a copy of the totals and works on that; maps in between are skipped.
-3. `run` returns when every expected vehicle has ended and is folded: the last map is solved and marked final, and
+1. Zenoh's threads only put events into the inbox, where every vehicle has its share.
+2. Changes are committed to the store before any effect of the same round is carried out: commit, then acknowledge. A
+   store that fails ends the service.
+3. The solver takes a copy of the totals and works on that; maps in between are skipped.
+4. `run` returns when every expected vehicle has ended and is folded: the last map is solved and marked final, and
    acknowledgements are repeated until the vehicles have left, for at most `LINGER_S`.
 """
 
 import logging
-import queue
 import threading
 import time
 from collections.abc import Callable
@@ -15,17 +16,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet_seif.bus import Bus
+from fleet_seif.bus import Bus, OnPut
 from fleet_seif.config import FusionSettings
-from fleet_seif.errors import NumericalError
-from fleet_seif.keys import Keys, vehicle_of
+from fleet_seif.errors import NumericalError, WireError
+from fleet_seif.keys import Keys, node_of, vehicle_of
 from fleet_seif.map_wire import encode_map, map_pieces
-from fleet_seif.messages import JointMap
-from fusion.core import AskRange, Effect, FusionCore, PutAck
+from fleet_seif.messages import Epoch, JointMap
+from fleet_seif.signing import Signer
+from fleet_seif.store import Put, Store, StoreError
+from fusion import records
+from fusion.core import AskEvents, AskRange, Effect, FusionCore, PutAck, PutStatus
+from fusion.inbox import Inbox
 from fusion.mapping import empty_map, make_map, map_input
 
 log = logging.getLogger(__name__)
-INBOX_MAX = 50_000
 BURST_MAX = 256
 TICK_S = 0.02
 PROGRESS_S = 0.2
@@ -41,7 +45,24 @@ class Statistics:
     maps: int = 0
     behind_s: list[float] = field(default_factory=list)
     solve_s: list[float] = field(default_factory=list)
-    dropped: int = 0
+
+
+def restore(core: FusionCore, store: Store) -> None:
+    """Fold again what a store has kept, and note whose it is. Raises StoreError where it is not this node's."""
+    mine = f"{core.ledger.fleet}/{core.node}".encode()
+    stored = dict(store.load(records.IDENTITY, records.IDENTITY + b"\0")).get(records.IDENTITY, mine)
+    if stored != mine:
+        raise StoreError(
+            f"the store is that of node {stored.decode()}, this is {mine.decode()}: give each node a store of its own"
+        )
+    try:
+        core.ledger.restore(store.load())
+    except WireError as error:
+        raise StoreError(
+            f"the store holds what this node never put there: {error}. Move it away and start afresh: vehicles and"
+            " other nodes send again what they hold"
+        ) from None
+    store.commit([Put(records.IDENTITY, mine)])
 
 
 class FusionService:
@@ -49,6 +70,7 @@ class FusionService:
 
     Args:
         bus: what vehicles are reached by. maps: what subscribers are reached by, where that is another.
+        store: where the ledger is kept, already restored into the core; None: in memory only. signer: signs maps.
         first_version: of its maps; one above those of an earlier node of this fleet lets subscribers go on.
     """
 
@@ -60,46 +82,61 @@ class FusionService:
         clock: Callable[[], float] = time.monotonic,
         maps: Bus | None = None,
         first_version: int = 0,
+        store: Store | None = None,
+        signer: Signer | None = None,
     ) -> None:
         self._bus = bus
         self._maps = maps or bus
         self._core = core
         self._settings = settings
         self._clock = clock
+        self._store = store
+        self._signer = signer
         self._keys = Keys(core.ledger.fleet)
-        self._inbox: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._inbox: Inbox[Event] = Inbox()
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._over = threading.Event()
         self._alive: set[str] = set()
         self._changed_at_s: float | None = None
         self._served = b""
-        self.newest: JointMap = empty_map(core.ledger.fleet, first_version - 1)
+        self.newest: JointMap = empty_map(core.ledger.fleet, core.node, first_version - 1)
         self.statistics = Statistics()
-        bus.subscribe(self._keys.deltas("*"), self._on_delta)
-        bus.subscribe(self._keys.heartbeats("*"), self._on_heartbeat)
-        bus.watch(self._keys.alive("*"), self._on_alive)
-        self._maps.answer(self._keys.map(), lambda key, data: [self._served] if self._served else [])
-        self._maps.announce(self._keys.node(core.node))
+        keys = self._keys
+        bus.subscribe(keys.deltas("*"), self._post(self._core.on_delta, vehicle_of))
+        bus.subscribe(keys.heartbeats("*"), self._post(self._core.on_heartbeat, vehicle_of))
+        bus.subscribe(keys.status("*"), self._post(self._core.on_status, node_of))
+        bus.watch(keys.alive("*"), self._on_alive)
+        bus.answer(keys.ledger("*"), self._on_range)
+        bus.answer(keys.events(core.node), self._on_events_asked)
+        self._maps.answer(keys.map(core.node), lambda key, data: [self._served] if self._served else [])
+        self._maps.announce(keys.node_alive(core.node))
 
-    def _post(self, event: Event) -> None:
-        if self._inbox.qsize() < INBOX_MAX:
-            self._inbox.put(event)
-        else:
-            self.statistics.dropped += 1
+    def _post(self, handle: Callable[[str, bytes, float], list[Effect]], name_of: Callable[[str], str]) -> OnPut:
+        """A handler that hands what comes by a key to the core, in its turn."""
 
-    def _on_delta(self, key: str, data: bytes) -> None:
-        self._post(lambda: self._core.on_delta(vehicle_of(key), data, self._clock()))
+        def put(key: str, data: bytes) -> None:
+            name = name_of(key)
+            self._inbox.put(name, lambda: handle(name, data, self._clock()), len(data))
 
-    def _on_heartbeat(self, key: str, data: bytes) -> None:
-        self._post(lambda: self._core.on_heartbeat(vehicle_of(key), data, self._clock()))
+        return put
 
     def _on_alive(self, key: str, alive: bool) -> None:
+        name = vehicle_of(key)
+
         def note() -> list[Effect]:
-            (self._alive.add if alive else self._alive.discard)(vehicle_of(key))
+            (self._alive.add if alive else self._alive.discard)(name)
             return []
 
-        self._post(note)
+        self._inbox.put(name, note)
+
+    def _on_range(self, key: str, data: bytes) -> list[bytes]:
+        with self._lock:
+            return self._core.answer_range(vehicle_of(key), data)
+
+    def _on_events_asked(self, key: str, data: bytes) -> list[bytes]:
+        with self._lock:
+            return self._core.answer_events()
 
     def run(self, on_progress: Callable[[FusionCore], None] | None = None) -> JointMap:
         """Work until every expected vehicle has ended and is folded, or until `stop`."""
@@ -116,9 +153,9 @@ class FusionService:
             self._over.set()
             solver.join()
         if self._core.complete:
-            for (vehicle, epoch), stream in self._core.ledger.streams.items():
+            for stream in self._core.ledger.streams.values():
                 if stream.next > 0:
-                    self._execute(self._core.ack_now(vehicle, epoch))
+                    self._execute(self._core.ack_now(stream))
             self._serve(final=True)
             end_s = self._clock() + LINGER_S
             while self._alive and self._clock() < end_s and not self._stop.is_set():
@@ -126,42 +163,53 @@ class FusionService:
             self._publish()  # once more: pieces of the only final map may have been dropped
         return self.newest
 
+    @property
+    def dropped(self) -> int:
+        """Events that came faster than they could be handled, and were dropped."""
+        return self._inbox.dropped
+
     def stop(self) -> None:
         """Make `run` return."""
         self._stop.set()
 
     def _work(self) -> None:
-        """Handle a part of what is in the inbox, and what is due."""
+        """Handle a part of what is in the inbox, and what is due. What is kept is committed before anybody is told."""
         effects: list[Effect] = []
-        try:
-            events = [self._inbox.get(timeout=TICK_S)]
-        except queue.Empty:
-            events = []
-        while events and len(events) < BURST_MAX:
-            try:
-                events.append(self._inbox.get_nowait())
-            except queue.Empty:
-                break
+        events = self._inbox.take(BURST_MAX, TICK_S)
         with self._lock:
             for event in events:
                 effects += event()
             effects += self._core.tick(self._clock())
+            changes = self._core.ledger.take_changes()
             if self._changed_at_s is None and self._core.changed:
                 self._changed_at_s = self._clock()
+        if self._store is not None and changes:
+            self._store.commit(changes)
         for effect in effects:
             self._execute(effect)
 
     def _execute(self, effect: Effect) -> None:
+        core, keys = self._core, self._keys
         match effect:
             case PutAck(vehicle=vehicle, data=data):
-                self._bus.put(self._keys.acks(vehicle), data)
-            case AskRange(vehicle=vehicle, epoch=epoch, data=data):
+                self._bus.put(keys.acks(vehicle), data, "control")
+            case PutStatus(data=data):
+                self._bus.put(keys.status(core.node), data, "control")
+            case AskRange(vehicle=vehicle, epoch=epoch, data=data, nodes=nodes):
+                key = keys.ledger(vehicle) if nodes else keys.outbox(vehicle)
+                replies = self._post(core.on_reply, lambda _: vehicle)
                 self._bus.ask(
-                    self._keys.outbox(vehicle),
+                    key,
                     data,
-                    lambda reply: self._post(lambda: self._core.on_reply(vehicle, reply, self._clock())),
-                    lambda: self._post(lambda: self._core.on_reply_done(vehicle, epoch, self._clock())),
+                    lambda reply: replies("", reply),
+                    lambda: self._done(vehicle, epoch),
                 )
+            case AskEvents(node=node):
+                events = self._post(lambda who, reply, _: core.on_events(who, reply), lambda _: node)
+                self._bus.ask(keys.events(node), b"", lambda reply: events("", reply), lambda: None)
+
+    def _done(self, vehicle: str, epoch: Epoch) -> None:
+        self._inbox.put(vehicle, lambda: self._core.on_reply_done(vehicle, epoch, self._clock()))
 
     def _solve_for_ever(self) -> None:
         """Serve a map when there is news: something folded, or a vehicle that fell silent or came back."""
@@ -190,15 +238,15 @@ class FusionService:
             raise
         self.statistics.solve_s.append(time.perf_counter() - begin)
         self.newest = newest
-        self._served = encode_map(newest)
+        self._served = encode_map(newest, self._signer)
         self._publish()
         self.statistics.maps += 1
         if changed_at_s is not None:
             self.statistics.behind_s.append(self._clock() - changed_at_s)
 
     def _publish(self) -> None:
-        for piece in map_pieces(self._served, self.newest.version):
-            self._maps.put(self._keys.map(), piece)
+        for piece in map_pieces(self._served, self._core.node, self.newest.version):
+            self._maps.put(self._keys.map(self._core.node), piece, "bulk")
 
     def behind_p99_s(self) -> float | None:
         """99th percentile of how far served maps were behind, s."""

@@ -3,7 +3,8 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,28 +12,40 @@ import typer
 from rich.console import Console
 from rich.logging import RichHandler
 
+from fleet_seif.bus import open_bus
 from fleet_seif.errors import NumericalError, RunError
 from fleet_seif.messages import check_name
 from fleet_seif.warm_up import warm_up
-from scenarios import children, output, watch
+from scenarios import children, output, tools, watch
+from scenarios.access import Kind
 from scenarios.config import ScenarioError, load_scenario, shipped
 from scenarios.launch import run_processes
 from scenarios.progress import progress_bars
 from scenarios.report import evaluate, write_folder
-from scenarios.source import record
+from scenarios.source import check_names, record
 from scenarios.table import report_table
 from scenarios.virtual import run_virtual
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
+ledger = typer.Typer(no_args_is_help=True, help="Look after the store of a fusion node.")
+app.add_typer(ledger, name="ledger")
 console = Console()
 errors = Console(stderr=True)
 
 
 def _fleet_name(name: str | None) -> str | None:
     """The name, if it can be part of a key."""
+    return None if name is None else _checked_name(name, "fleet")
+
+
+def _node_name(name: str) -> str:
+    return _checked_name(name, "node")
+
+
+def _checked_name(name: str, what: str) -> str:
     try:
-        return name if name is None else check_name(name, "fleet")
+        return check_name(name, what)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
 
@@ -45,6 +58,10 @@ InsecureOption = Annotated[bool, typer.Option("--insecure", help="Allow unencryp
 FleetOption = Annotated[
     str | None, typer.Option(help="Name of the fleet; the scenario's by default.", callback=_fleet_name)
 ]
+StoreOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Where it keeps what it must not lose.")]
+SigningKeyOption = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Its private signing key.")]
+KeyRingOption = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Public keys of the fleet.")]
+FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The store of a fusion node.")]
 SupervisedOption = Annotated[bool, typer.Option("--supervised", hidden=True)]
 ResultOption = Annotated[Path | None, typer.Option(hidden=True)]
 
@@ -87,6 +104,11 @@ def run(
 ) -> None:
     """Run a scenario: one process per vehicle and one for fusion, over Zenoh on loopback."""
     chosen = load_scenario(scenario, tuple(settings or ()), seed)
+    if chosen.fleet.nodes > 1 and not chosen.fusion.required_acks:
+        names = list(chosen.fleet.node_names)  # no vehicle leaves before every node has all of it
+        settings = [*(settings or ()), f"fusion.required_acks={names}"]
+        chosen = load_scenario(scenario, tuple(settings), seed)
+    check_names(chosen)
     say = _nothing if quiet else _say
     if out is not None:
         output.prepare_folder(out)
@@ -97,7 +119,7 @@ def run(
         if virtual:
             finished = run_virtual(scenario, chosen, recording, progress)
             if out is not None:  # in a real run the fusion process writes it
-                output.write_ledger(out / "process" / "ledger.bin", finished.ledger)
+                output.write_ledger(out / "process" / "fusion.ledger", finished.ledger)
         else:
             again = [scenario, *(part for item in settings or () for part in ("--set", item))]
             again += ["--seed", str(chosen.run.seed)]
@@ -116,30 +138,62 @@ def run(
 @_clear_errors()
 def fusion(
     listen: Annotated[list[str] | None, typer.Option(help="Where to listen, e.g. tcp/127.0.0.1:7447.")] = None,
+    connect: Annotated[list[str] | None, typer.Option(help="Other fusion nodes or hubs to link to.")] = None,
+    name: Annotated[str, typer.Option(help="Name of this node.", callback=_node_name)] = "fusion",
     fleet: FleetOption = None,
+    store: StoreOption = None,
     expected: Annotated[int, typer.Option(min=0, help="End after so many vehicles have ended; 0: go on.")] = 0,
     scenario: Annotated[str | None, typer.Option(help="Take [fusion] and [link] settings from a scenario.")] = None,
     seed: SeedOption = None,
     settings: SetOption = None,
     config: ConfigOption = None,
     insecure: InsecureOption = False,
+    signing_key: SigningKeyOption = None,
+    key_ring: KeyRingOption = None,
     result: ResultOption = None,
     supervised: SupervisedOption = False,
 ) -> None:
     """Run one fusion node: host a Zenoh router, fold what vehicles publish, serve the joint map."""
     chosen = load_scenario(scenario or "three_air_vehicles", tuple(settings or ()), seed)
+    say, supervision = _as_child(supervised)
     children.run_fusion(
         fleet=fleet or (chosen.fleet.name if scenario else "fleet"),
+        name=name,
         settings=chosen.fusion,
         link=chosen.link,
+        faults=chosen.faults,
         seed=chosen.run.seed,
-        listen=_endpoints(listen, config),
-        config=config,
-        insecure=insecure,
+        place=children.Place(
+            listen=_endpoints(listen, config),
+            connect=connect or [],
+            config=config,
+            insecure=insecure,
+            store=store,
+            result=result,
+            signing_key=signing_key,
+            key_ring=key_ring,
+        ),
         expected=expected,
-        result=result,
-        say=_as_child(supervised)[0],
+        say=say,
+        supervision=supervision,
     )
+
+
+@app.command()
+@_clear_errors()
+def hub(
+    listen: Annotated[list[str] | None, typer.Option(help="Where to listen, e.g. tcp/127.0.0.1:7447.")] = None,
+    connect: Annotated[list[str] | None, typer.Option(help="Fusion nodes or hubs to link to.")] = None,
+    config: ConfigOption = None,
+    insecure: InsecureOption = False,
+) -> None:
+    """Run a Zenoh router alone: what fusion nodes host anyway, where a network needs one more."""
+    children.end_on_sigterm()
+    with open_bus(
+        listen=_endpoints(listen, config), connect=connect or [], config=config, insecure=insecure, mode="router"
+    ) as bus:
+        _say(f"listening on {bus.endpoints()[0]}")
+        threading.Event().wait()
 
 
 @app.command()
@@ -147,27 +201,39 @@ def fusion(
 def vehicle(
     scenario: ScenarioArgument,
     name: Annotated[str, typer.Option(help="Which of the scenario's vehicles.")],
-    connect: Annotated[list[str] | None, typer.Option(help="The fusion node, e.g. tcp/127.0.0.1:7447.")] = None,
+    connect: Annotated[list[str] | None, typer.Option(help="Fusion nodes, e.g. tcp/127.0.0.1:7447.")] = None,
     fleet: FleetOption = None,
+    store: StoreOption = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Begin a new life though the store knows one.")] = False,
+    life: Annotated[int, typer.Option(min=0, help="Number of the first life of a new store.")] = 0,
     seed: SeedOption = None,
     settings: SetOption = None,
     config: ConfigOption = None,
     insecure: InsecureOption = False,
+    signing_key: SigningKeyOption = None,
+    key_ring: KeyRingOption = None,
     result: ResultOption = None,
     supervised: SupervisedOption = False,
 ) -> None:
     """Run one vehicle of a scenario against a fusion node."""
-    say, wait_for_go = _as_child(supervised)
+    say, supervision = _as_child(supervised)
     overrides = [*(settings or ()), *([f"fleet.name='{fleet}'"] if fleet else [])]
     children.run_vehicle(
         load_scenario(scenario, tuple(overrides), seed),
         name=name,
-        connect=_endpoints(connect, config),
-        config=config,
-        insecure=insecure,
-        result=result,
+        place=children.Place(
+            connect=_endpoints(connect, config),
+            config=config,
+            insecure=insecure,
+            store=store,
+            result=result,
+            signing_key=signing_key,
+            key_ring=key_ring,
+        ),
         say=say,
-        wait_for_go=wait_for_go,
+        supervision=supervision,
+        fresh=fresh,
+        life=life,
     )
 
 
@@ -185,16 +251,72 @@ def watch_map(
     asyncio.run(watch.watch(endpoints, fleet, as_json, config, insecure, console))
 
 
+@app.command()
+@_clear_errors()
+def status(
+    endpoint: Annotated[str | None, typer.Argument(help="A fusion node, tcp/127.0.0.1:7447 by default.")] = None,
+    fleet: Annotated[str, typer.Option(help="Name of the fleet.", callback=_fleet_name)] = "fleet",
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    config: ConfigOption = None,
+    insecure: InsecureOption = False,
+) -> None:
+    """Say once how every vehicle of a fleet is, and why one is quarantined."""
+    tools.show_status(_endpoints([endpoint] if endpoint else None, config), fleet, as_json, config, insecure, console)
+
+
+@ledger.command()
+@_clear_errors()
+def info(file: FileArgument) -> None:
+    """Say what a store holds."""
+    tools.ledger_info(file, console)
+
+
+@ledger.command()
+@_clear_errors()
+def verify(file: FileArgument) -> None:
+    """Check a store: the file, every message in it, and the verdicts."""
+    tools.ledger_verify(file, console)
+
+
+@ledger.command()
+@_clear_errors()
+def compact(file: FileArgument) -> None:
+    """Replace single messages by snapshots, and give back the space. The node must not be running."""
+    tools.ledger_compact(file, console)
+
+
+@app.command()
+@_clear_errors()
+def keys(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", file_okay=False, help="Keep them here; made before: add.")],
+    fleet: Annotated[str, typer.Option(help="Name of the fleet.", callback=_fleet_name)] = "fleet",
+    node: Annotated[list[str] | None, typer.Option(help="A fusion node; each with an --endpoint.")] = None,
+    endpoint: Annotated[
+        list[str] | None, typer.Option(metavar="tls/HOST:PORT", help="Where others reach the --node of the same place.")
+    ] = None,
+    host: Annotated[list[str] | None, typer.Option(help="A further name or address of these nodes.")] = None,
+    vehicle: Annotated[list[str] | None, typer.Option(help="A vehicle.")] = None,
+    operator: Annotated[list[str] | None, typer.Option(help="Who decides about vehicles.")] = None,
+    viewer: Annotated[list[str] | None, typer.Option(help="Who looks at maps.")] = None,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="How long certificates are valid.")] = 365,
+    renew: Annotated[bool, typer.Option("--renew", help="New keys for those named; the old are void.")] = False,
+) -> None:
+    """Make certificates, signing keys and Zenoh configurations for a fleet, or for more of its members."""
+    named = {Kind.VEHICLE: vehicle or [], Kind.OPERATOR: operator or [], Kind.VIEWER: viewer or []}
+    members = tools.members_of(node or [], endpoint or [], host or [], named)
+    tools.make_fleet_keys(folder, fleet, members, days, renew, console)
+
+
 def _endpoints(given: list[str] | None, config: Path | None) -> list[str]:
     """What was asked for; the default only where no configuration file says it."""
     return given or ([] if config else [DEFAULT_ENDPOINT])
 
 
-def _as_child(supervised: bool) -> tuple[children.Say, Callable[[], None]]:
+def _as_child(supervised: bool) -> tuple[children.Say, children.Supervision]:
     """How a process speaks, and how it waits for the others: for the launcher, or for a person."""
     children.end_on_sigterm()
     if supervised:
-        return children.say_json, children.supervise()
+        return children.say_json, children.Supervision()
     last: dict[str, Any] = {}
 
     def tell(event: dict[str, Any]) -> None:
@@ -203,7 +325,7 @@ def _as_child(supervised: bool) -> tuple[children.Say, Callable[[], None]]:
             last = event
             console.print("  ".join(f"{key}={value}" for key, value in event.items()), highlight=False, soft_wrap=True)
 
-    return tell, lambda: None
+    return tell, children.Supervision(alone=True)
 
 
 def _say(text: str) -> None:

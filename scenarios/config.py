@@ -10,10 +10,12 @@ from pydantic import Field, ValidationError, model_validator
 from fleet_seif.config import FilterSettings, FusionSettings, NotNegative, PublishSettings, Settings
 from fleet_seif.link import LinkSettings
 from fleet_seif.messages import NAME_MAX
+from scenarios.faults import FaultSettings
 from scenarios.mrclam import DatasetSettings
 from scenarios.world import NoiseSettings, WorldSettings
 
 VEHICLES_MAX = 100
+NODES_MAX = 10
 
 
 class ScenarioError(ValueError):
@@ -21,10 +23,16 @@ class ScenarioError(ValueError):
 
 
 class FleetSettings(Settings):
-    """Who takes part. vehicles: how many simulated ones (a data set brings its own)."""
+    """Who takes part. vehicles: how many simulated ones (a data set brings its own). nodes: fusion nodes."""
 
     name: Annotated[str, Field(pattern=rf"^[A-Za-z0-9_-]{{1,{NAME_MAX}}}$")] = "fleet"
     vehicles: Annotated[int, Field(ge=1, le=VEHICLES_MAX)] = 3
+    nodes: Annotated[int, Field(ge=1, le=NODES_MAX)] = 1
+
+    @property
+    def node_names(self) -> tuple[str, ...]:
+        """fusion, fusion2, fusion3, ..."""
+        return tuple("fusion" if i == 0 else f"fusion{i + 1}" for i in range(self.nodes))
 
 
 class RunSettings(Settings):
@@ -48,6 +56,7 @@ class Scenario(Settings):
     publish: PublishSettings = PublishSettings()
     fusion: FusionSettings = FusionSettings()
     link: LinkSettings = LinkSettings()
+    faults: FaultSettings = FaultSettings()
     run: RunSettings = RunSettings()
 
     @model_validator(mode="after")

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import JointSolution, landmark_classes, marginal_covariances, solve
+from fleet_seif.joint import JointSolution, marginal_covariances, solve
 from fleet_seif.records import Floats
 from fusion.ledger import Ledger
-from fusion.mapping import lives_of
 from scenarios.recording import Log, Recording
 
 
@@ -36,9 +35,13 @@ def uncertainty_of(moment: Moment, earlier: Moment) -> float:
 
 def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
     """The joint map at ascending times: the cut of all messages up to then. Times without a map are left out."""
-    again = Ledger(ledger.fleet, 1)
+    again = Ledger(ledger.fleet)
     waiting = sorted(
-        ((t, i, data) for s in ledger.placed() for i, (t, data) in enumerate(zip(s.times_s, s.log, strict=True))),
+        (
+            (t, i, data)
+            for s in ledger.streams.values()
+            for i, (t, data) in enumerate(zip(s.times_s, s.log, strict=True))
+        ),
         key=lambda item: item[:2],
     )
     at = 0
@@ -46,8 +49,8 @@ def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
         while at < len(waiting) and waiting[at][0] <= time_s:
             again.accept(waiting[at][2])
             at += 1
-        lives = lives_of(again)
-        classes = landmark_classes(lives)
+        lives = again.lives(live=True)
+        classes = again.classes(lives)
         if not classes:
             continue
         try:

@@ -7,21 +7,23 @@ from typing import Any, Final
 
 import numpy as np
 
-from fleet_seif.errors import RunError
+from fleet_seif.errors import RunError, WireError
 from fleet_seif.joint import JointSolution
 from fleet_seif.records import Floats, Ints
+from fleet_seif.sqlite_store import SqliteStore
+from fleet_seif.store import StoreError
+from fusion import records
 from fusion.core import FusionCore
 from fusion.ledger import Ledger
 from scenarios.recording import Log, Recording
 from vehicles.drive import DriveResult
 
 FORMAT: Final = 1
-PARKED_MAX: Final = 1
 PARTS: Final = {
     "": ("report.json", "map.npz", "map.json", "truth.npz", "figure.png"),
     "readings": ("*.npz",),
     "trajectory": ("*.tum",),
-    "process": ("*.npz", "fusion.json", "ledger.bin"),
+    "process": ("*.npz", "*.json", "*.ledger*", "*.outbox*"),
 }
 
 
@@ -113,37 +115,44 @@ def write_json(path: Path, value: Mapping[str, object]) -> None:
     path.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
-def stream_facts(core: FusionCore, now_s: float) -> dict[str, dict[str, int]]:
-    """Per vehicle what a report says of its messages; of several epochs, the one that is placed."""
-    return {
-        state.name: {
+def stream_facts(core: FusionCore, now_s: float) -> dict[str, dict[str, Any]]:
+    """Per vehicle what a report says of its messages, over all its epochs."""
+    facts: dict[str, dict[str, Any]] = {}
+    for state in core.states(now_s):
+        counts = {
+            "epochs": 1,
             "deltas_folded": state.cut + 1,
             "duplicates": state.duplicates,
             "gaps_repaired": state.gaps_repaired,
             "parked": state.parked,
             "messages_refused": state.refused,
         }
-        for state in sorted(core.states(now_s), key=lambda state: state.placed)
-    }
+        before = facts.setdefault(state.name, {**dict.fromkeys(counts, 0), "quarantine": ""})
+        for name, count in counts.items():
+            before[name] += count
+        before["quarantine"] = before["quarantine"] or state.fault
+    return facts
 
 
 def write_ledger(path: Path, ledger: Ledger) -> None:
-    """Every folded message, each behind its length (4 bytes, little-endian), stream by stream."""
-    with path.open("wb") as file:
-        for stream in ledger.streams.values():
-            for data in stream.log:
-                file.write(len(data).to_bytes(4, "little") + data)
+    """A store as a fusion node would have left it."""
+    store = SqliteStore.open(path, records.KIND, records.SCHEMA)
+    try:
+        store.commit(ledger.contents())
+    finally:
+        store.close()
 
 
 def read_ledger(path: Path, fleet: str) -> Ledger:
-    """The ledger from such a file, folded anew."""
-    ledger = Ledger(fleet, PARKED_MAX)
-    data = path.read_bytes()
-    at = 0
-    while at < len(data):
-        size = int.from_bytes(data[at : at + 4], "little")
-        ledger.accept(data[at + 4 : at + 4 + size])
-        at += 4 + size
+    """The ledger of a store, folded anew; others may be writing it. Raises StoreError."""
+    store = SqliteStore.open(path, records.KIND, records.SCHEMA, read_only=True)
+    ledger = Ledger(fleet)
+    try:
+        ledger.restore(store.load())
+    except WireError as error:
+        raise StoreError(f"{path} holds what no fusion node of fleet {fleet!r} put there: {error}") from None
+    finally:
+        store.close()
     return ledger
 
 

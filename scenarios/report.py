@@ -6,10 +6,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from fleet_seif.joint import JointSolution, landmark_classes, marginal_covariances, solve
+from fleet_seif.joint import JointSolution, marginal_covariances, solve
 from fleet_seif.records import Floats
 from fusion.ledger import Ledger
-from fusion.mapping import lives_of
 from scenarios import output
 from scenarios.config import Scenario
 from scenarios.figure import draw_figure, figure_times
@@ -48,8 +47,8 @@ class Outcome:
 
 def evaluate(run: FinishedRun) -> Outcome:
     """Solve canonically and score."""
-    lives = lives_of(run.ledger)
-    solution = solve(lives, landmark_classes(lives))
+    lives = run.ledger.lives()
+    solution = solve(lives, run.ledger.classes(lives))
     landmark_cov, _ = marginal_covariances(solution)
     score = score_map(solution, landmark_cov, run.recording)
     report = {

@@ -121,6 +121,7 @@ def score_vehicle(result: DriveResult, log: Log, landmarks: Floats) -> Mapping[s
     truth = np.array([truths.get(signature, -1) for signature in result.signatures.tolist()], np.int64)
     known = truth >= 0
     with_truth = np.all(np.isfinite(log.truth_pose), axis=1)
+    with_truth &= np.all(np.isfinite(result.pose), axis=1)  # steps of a process that was killed are not known
     pose_error = result.pose[with_truth, :2] - log.truth_pose[with_truth, :2]
     return {
         "landmark_rmse_m": rmse(result.landmarks[known] - landmarks[truth[known]]),

@@ -14,6 +14,22 @@ def vehicle_names(scenario: Scenario) -> tuple[str, ...]:
     return tuple(f"v{i + 1}" for i in range(scenario.fleet.vehicles))
 
 
+def check_names(scenario: Scenario) -> None:
+    """Raise ScenarioError where [faults] or [link] names a process that does not take part."""
+    known = {*vehicle_names(scenario), *scenario.fleet.node_names}
+    named = {
+        "faults.events": {fault.who for fault in scenario.faults.events},
+        "faults.hostile": {hostile.who for hostile in scenario.faults.hostile},
+        "link.cuts": {who for cut in scenario.link.cuts for who in cut.who},
+        "fusion.required_acks": set(scenario.fusion.required_acks),
+    }
+    for table, names in named.items():
+        if names - known:
+            raise ScenarioError(
+                f"[{table}] {', '.join(sorted(names - known))}: the processes are {', '.join(sorted(known))}"
+            )
+
+
 def record(scenario: Scenario, only: str | None = None) -> Recording:
     """Every reading of a scenario's vehicles, or of one of them. The same arguments give the same readings.
 

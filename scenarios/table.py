@@ -35,6 +35,7 @@ def report_table(report: dict[str, Any]) -> Group:
         f"NEES per dof {_number(report['nees_per_dof'], 2)}",
         f"merges {report['merges']}, wrong {report['wrong_merges']}, missed {report['missed_merges']}",
         *(f"{n} readings of {name} were refused: its map lacks them" for name, n in refused.items()),
+        *(f"{n} is quarantined: {row['quarantine']}" for n, row in report["vehicles"].items() if row["quarantine"]),
         f"digest {report['digest'][:16]}",
     ]
     return Group(table, Text("\n".join(lines)))

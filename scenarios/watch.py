@@ -1,6 +1,8 @@
 """The joint map in a terminal, or as JSON lines."""
 
+import asyncio
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,10 @@ from rich.table import Table
 from rich.text import Text
 
 from fleet_seif.client import connect
-from fleet_seif.messages import JointMap
+from fleet_seif.errors import RunError
+from fleet_seif.messages import JointMap, VehicleState
 
+FIRST_S = 10.0
 GRID_ROWS = 22
 GRID_COLUMNS = 72
 
@@ -31,10 +35,25 @@ async def watch(
                 live.update(picture(joint))
 
 
+async def newest_map(endpoints: list[str], fleet: str, config: Path | None, insecure: bool) -> JointMap:
+    """The map that a fusion node serves now. Raises RunError where none comes."""
+    async with connect(endpoints, fleet=fleet, config=config, insecure=insecure) as client:
+        try:
+            return await asyncio.wait_for(anext(client.maps()), FIRST_S)
+        except TimeoutError:
+            raise RunError(f"no map of fleet {fleet!r} within {FIRST_S:.0f} s: is that its name?") from None
+
+
+def state_dict(state: VehicleState) -> dict[str, Any]:
+    """The state of a vehicle as JSON values."""
+    return {**vars(state), "epoch": list(state.epoch)}
+
+
 def as_dict(joint: JointMap) -> dict[str, Any]:
     """A map as JSON values."""
     return {
         "fleet": joint.fleet,
+        "node": joint.node,
         "version": joint.version,
         "canonical": joint.canonical,
         "final": joint.final,
@@ -51,29 +70,13 @@ def as_dict(joint: JointMap) -> dict[str, Any]:
             for i, names in enumerate(joint.names)
         ],
         "poses": {name: joint.pose_mean[i].tolist() for i, name in enumerate(joint.poses)},
-        "vehicles": [
-            {
-                "name": state.name, "life": state.life, "cut": state.cut, "behind": state.behind,
-                "parked": state.parked,
-                "duplicates": state.duplicates, "gaps_repaired": state.gaps_repaired, "refused": state.refused,
-                "placed": state.placed, "stalled": state.stalled, "ended": state.ended, "healthy": state.healthy,
-            }
-            for state in joint.vehicles
-        ],
+        "vehicles": [state_dict(state) for state in joint.vehicles],
         "counters": joint.counters,
-    }  # fmt: skip
+    }
 
 
 def picture(joint: JointMap) -> RenderableType:
     """Map, uncertainty and the health of each vehicle."""
-    table = Table(box=None)
-    for head in ("vehicle", "folded", "behind", "parked", "duplicates", "repaired", "refused", "state"):
-        table.add_column(head, justify="left" if head in ("vehicle", "state") else "right")
-    for s in joint.vehicles:
-        state = "ended" if s.ended else "stalled" if s.stalled else "mapping"
-        state += ("" if s.healthy else ", doubtful") + ("" if s.placed else ", not placed")
-        counts = (s.cut + 1, s.behind, s.parked, s.duplicates, s.gaps_repaired, s.refused)
-        table.add_row(s.name, *(str(count) for count in counts), state)
     deviation = ""
     if len(joint.landmark_cov):
         largest = np.sqrt(np.linalg.eigvalsh(joint.landmark_cov)[:, -1])
@@ -83,7 +86,45 @@ def picture(joint: JointMap) -> RenderableType:
         f"fleet {joint.fleet}  map {joint.version}{' final' if joint.final else ''}  "
         f"{len(joint.names)} landmarks ({shared} shared){deviation}"
     )
-    return Group(Text(head), grid(joint), table)
+    return Group(Text(head), grid(joint), vehicle_table(joint.vehicles))
+
+
+def vehicle_table(states: Sequence[VehicleState]) -> Table:
+    """How every epoch of every vehicle is."""
+    table = Table(box=None)
+    for head in (
+        "vehicle",
+        "life",
+        "epoch",
+        "folded",
+        "behind",
+        "parked",
+        "duplicates",
+        "repaired",
+        "refused",
+        "state",
+    ):
+        table.add_column(head, justify="left" if head in ("vehicle", "state") else "right")
+    for s in states:
+        counts = (s.life, s.epoch.counter, s.cut + 1, s.behind, s.parked, s.duplicates, s.gaps_repaired, s.refused)
+        table.add_row(s.name, *(str(count) for count in counts), state_words(s, states))
+    return table
+
+
+def state_words(s: VehicleState, states: Sequence[VehicleState]) -> str:
+    """A state in words. An epoch that stopped short and was followed by one that does not continue it has a gap."""
+    if s.fault:
+        return f"quarantined at {s.checked}: {s.fault}"
+    later = [other for other in states if other.name == s.name and other.epoch > s.epoch]
+    if s.ended:
+        words = "ended"
+    elif any(other.life == s.life and other.placed == s.placed and other.cut >= 0 for other in later):
+        words = "continued"
+    elif later and s.behind:
+        words = f"outbox lost: {s.behind} messages after {s.cut} are missing"
+    else:
+        words = "stalled" if s.stalled else "mapping"
+    return words + ("" if s.healthy else ", doubtful") + ("" if s.placed else ", not placed")
 
 
 def grid(joint: JointMap) -> Text:

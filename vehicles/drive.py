@@ -2,8 +2,8 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,18 +36,24 @@ class DriveResult:
     sightings_refused: int
 
 
-@dataclass
 class Notes:
-    """Collects a DriveResult step by step."""
+    """Collects a DriveResult step by step; steps that another process has taken stay NaN."""
 
-    pose: list[Floats] = field(default_factory=list)
-    filter_s: list[float] = field(default_factory=list)
-    publish_s: list[float] = field(default_factory=list)
+    def __init__(self, steps: int) -> None:
+        self.pose = np.full((steps + 1, 3), np.nan)
+        self.filter_s: list[float] = []
+        self.publish_s: list[float] = []
+
+    def take(self, step: int, pose: Floats, filter_s: float | None = None) -> None:
+        """The pose after a step, and how long it took; 0 is before any motion."""
+        self.pose[step] = pose
+        if filter_s is not None:
+            self.filter_s.append(filter_s)
 
     def result(self, landmarks: Floats, signatures: list[int], counters: Counters) -> DriveResult:
         """All of it, with what the vehicle counted."""
         return DriveResult(
-            pose=np.array(self.pose).reshape(-1, 3),
+            pose=self.pose,
             landmarks=landmarks,
             signatures=np.array(signatures, np.int64),
             filter_s=np.array(self.filter_s),
@@ -63,31 +69,35 @@ def drive(
     vehicle: Vehicle,
     first: Sightings,
     start_s: float,
-    readings: Iterator[Reading],
+    readings: Sequence[Reading],
     rate_hz: float,
     on_step: Callable[[int], None] = lambda step: None,
 ) -> DriveResult:
-    """Feed every reading, end the stream and wait until a fusion node holds all of it.
+    """Feed every reading that the vehicle has not taken yet, end the stream and wait until it is acknowledged.
 
-    rate_hz: readings a second; 0: as fast as acknowledgements allow.
+    rate_hz: readings a second; 0: as fast as acknowledgements allow. A resumed vehicle stood still while it was down,
+    so its next reading is the one after its last committed step.
 
     Raises RunError where nothing is acknowledged for SILENCE_S.
     """
-    notes = Notes()
-    vehicle.start(first, time_s=start_s)
-    notes.pose.append(vehicle.pose)
+    notes = Notes(len(readings))
+    if not vehicle.started:
+        vehicle.start(first, time_s=start_s)
+        notes.take(0, vehicle.pose)
     begin = time.monotonic()
-    for step, reading in enumerate(readings, start=1):
+    done = sum(reading.time_s <= vehicle.time_s for reading in readings)
+    for step, reading in enumerate(readings[done:], start=done + 1):
+        if vehicle.ended:
+            break
         if rate_hz:
-            time.sleep(max(0.0, begin + step / rate_hz - time.monotonic()))
+            time.sleep(max(0.0, begin + (step - done) / rate_hz - time.monotonic()))
         elif not vehicle.wait_for_room(SILENCE_S):
             raise _silence()
         try:
             vehicle.step(reading.odometry, reading.odometry_cov, reading.sightings, time_s=reading.time_s)
         except (ReadingRefused, NumericalError) as error:
             log.error("reading_refused step=%d reason=%s", step, error)
-        notes.pose.append(vehicle.pose)
-        notes.filter_s.append(vehicle.filter_s)
+        notes.take(step, vehicle.pose, vehicle.filter_s)
         notes.publish_s.append(vehicle.publish_s)
         on_step(step)
     vehicle.end()

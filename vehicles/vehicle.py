@@ -1,15 +1,19 @@
 """The vehicle core in its shell: the one class for a robot of your own and for the vehicle process.
 
-1. With a bus, a thread of its own sends heartbeats, takes acknowledgements and answers range queries.
-2. Without one, everything else works; messages are kept (and coalesced) in the outbox.
-3. `step` never waits for the network; `wait_for_room` does, for those who want to.
+1. With a bus or a store, a thread of its own commits, puts, sends heartbeats and takes acknowledgements.
+2. Without a bus, everything else works; messages are kept (and coalesced) in the outbox.
+3. `step` never waits for the network or the disk; `wait_for_room` does, for those who want to. Several steps may share
+   one commit; nothing is put before it is committed.
+4. A store that fails ends it: from then on every call raises what went wrong.
 """
 
+import contextlib
+import logging
 import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import TracebackType
 
 import numpy as np
@@ -22,10 +26,14 @@ from fleet_seif.messages import Epoch
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
 from fleet_seif.seif import StepResult
+from fleet_seif.signing import KeyRing, Signer
+from fleet_seif.store import Store
 from vehicles.core import Counters, Identity, VehicleCore
 
+log = logging.getLogger(__name__)
 TICK_S = 0.05
 ACKS_MAX = 10_000
+CLOSE_S = 10.0
 
 
 def symmetric(matrix: ArrayLike) -> Floats:
@@ -43,6 +51,13 @@ class Vehicle:
         start_pose_cov: its covariance, (3, 3); None: the start pose is given.
         epoch: of this run; by default this machine's time in ms, so that a later run counts as later, and a nonce.
         bus: an open bus (fleet_seif.bus.open_bus), or None to map alone.
+        store: where filter and outbox are kept, open; a vehicle that is made again with it goes on where the last
+            committed step ended (see `time_s`), in a new epoch. None: in memory only.
+        fresh: begin a new life, at `start_pose`, though the store knows an earlier one. life: number of the first one.
+        required_acks: fusion nodes that must have acknowledged a message before it is forgotten; none: any one.
+        signer, keys: private key of this vehicle and public keys of the fleet, where it signs its messages.
+
+    Raises RunError where the store cannot be gone on with.
     """
 
     def __init__(
@@ -58,34 +73,45 @@ class Vehicle:
         model: int = RANGE_BEARING,
         epoch: Epoch | None = None,
         clock: Callable[[], float] = time.monotonic,
+        store: Store | None = None,
+        fresh: bool = False,
+        life: int = 0,
+        required_acks: Sequence[str] = (),
+        signer: Signer | None = None,
+        keys: KeyRing | None = None,
     ) -> None:
+        counter = 1 if store is not None else time.time_ns() // 1_000_000
         identity = Identity(
             fleet=fleet,
             vehicle=name,
-            epoch=epoch or Epoch(time.time_ns() // 1_000_000, secrets.randbits(64)),
+            epoch=epoch or Epoch(counter, secrets.randbits(64)),
             start_pose=np.asarray(start_pose, float),
             start_pose_cov=np.zeros((3, 3)) if start_pose_cov is None else symmetric(start_pose_cov),
+            life=life,
         )
-        self._core = VehicleCore(identity, settings or FilterSettings(), publish or PublishSettings(), model)
+        self._core = VehicleCore(
+            identity, settings or FilterSettings(), publish or PublishSettings(), model,
+            required=tuple(required_acks), durable=store is not None, signer=signer, keys=keys,
+        )  # fmt: skip
+        self.resumed = store is not None and self._core.resume(store.load(), fresh=fresh)
         self._clock = clock
         self._bus = bus
+        self._store = store
         self._keys = Keys(fleet)
         self._lock = threading.Lock()
         self._acknowledged = threading.Condition(self._lock)
         self._acks: queue.Queue[bytes | None] = queue.Queue(ACKS_MAX)
         self._thread: threading.Thread | None = None
+        self._failure: Exception | None = None
         self.filter_s = 0.0
         self.publish_s = 0.0
         if bus is not None:
-            self._connect(bus)
-
-    def _connect(self, bus: Bus) -> None:
-        name = self._core.identity.vehicle
-        bus.subscribe(self._keys.acks(name), lambda _, data: self._put_ack(data))
-        bus.answer(self._keys.outbox(name), lambda _, data: self._on_range(data))
-        bus.announce(self._keys.alive(name))
-        self._thread = threading.Thread(target=self._serve, name=f"vehicle-{name}", daemon=True)
-        self._thread.start()
+            bus.subscribe(self._keys.acks(name), lambda _, data: self._put_ack(data))
+            bus.answer(self._keys.outbox(name), lambda _, data: self._on_range(data))
+            bus.announce(self._keys.alive(name))
+        if bus is not None or store is not None:
+            self._thread = threading.Thread(target=self._serve, name=f"vehicle-{name}", daemon=True)
+            self._thread.start()
 
     def _put_ack(self, data: bytes) -> None:
         if not self._acks.full():  # a later acknowledgement says all that a dropped one said
@@ -96,21 +122,42 @@ class Vehicle:
             return self._core.on_range(data)
 
     def _serve(self) -> None:
-        while True:
-            try:
-                data = self._acks.get(timeout=TICK_S)
-            except queue.Empty:
-                data = b""
-            if data is None:
-                return
+        try:
+            while self._serve_once():
+                pass
+        except Exception as error:  # kept for whoever calls next: a vehicle must not go on in silence
+            log.error("vehicle_stopped vehicle=%s reason=%s", self._core.identity.vehicle, error)
             with self._lock:
-                if data:
-                    self._core.on_ack(data)
-                    self._acknowledged.notify_all()
-                self._publish()
-                heartbeat = self._core.tick(self._clock())
-            if heartbeat is not None and self._bus is not None:
-                self._bus.put(self._keys.heartbeats(self._core.identity.vehicle), heartbeat)
+                self._failure = error
+                self._acknowledged.notify_all()
+
+    def _serve_once(self) -> bool:
+        """Handle an acknowledgement, if one is there, and what is due. False at the end."""
+        try:
+            data = self._acks.get(timeout=TICK_S)
+        except queue.Empty:
+            data = b""
+        with self._lock:
+            if data:
+                self._core.on_ack(data)
+                self._acknowledged.notify_all()
+        self._commit()
+        with self._lock:
+            self._publish()
+            heartbeats = self._core.tick(self._clock())
+        if self._bus is not None:
+            for heartbeat in heartbeats:
+                self._bus.put(self._keys.heartbeats(self._core.identity.vehicle), heartbeat, "control")
+        return data is not None
+
+    def _commit(self) -> None:
+        """Make durable what has changed; the caller does not hold the lock, so that steps go on meanwhile."""
+        with self._lock:
+            changes, mark = self._core.take_changes()
+        if self._store is not None and changes:
+            self._store.commit(changes)
+        with self._lock:
+            self._core.note_commit(mark)
 
     def _publish(self) -> None:
         """Put what may be put; the caller holds the lock, so that messages leave in order."""
@@ -118,11 +165,24 @@ class Vehicle:
             for data in self._core.release():
                 self._bus.put(self._keys.deltas(self._core.identity.vehicle), data)
 
+    def _hand_over(self) -> None:
+        """After a step, with the lock: put what it brought at once, or have it committed first."""
+        if self._store is None:
+            self._core.note_commit(self._core.take_changes()[1])
+            self._publish()
+        elif not self._acks.full():
+            self._acks.put_nowait(b"")
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
     def start(self, sightings: Sightings | None = None, *, time_s: float | None = None) -> StepResult:
         """Say hello, with what is seen before any motion. `step` does it with nothing seen if you do not."""
         with self._lock:
+            self._check()
             result = self._core.start(self._time(time_s), sightings or Sightings.none())
-            self._publish()
+            self._hand_over()
             return result
 
     def step(
@@ -152,12 +212,13 @@ class Vehicle:
             sightings=sightings or Sightings.none(),
         )
         with self._lock:
+            self._check()
             begin = time.perf_counter()
             if self._core.outbox.last < 0:
                 self._core.start(np.nextafter(reading.time_s, -np.inf), Sightings.none())
             result = self._core.step(reading)
             middle = time.perf_counter()
-            self._publish()
+            self._hand_over()
             self.filter_s, self.publish_s = middle - begin, time.perf_counter() - middle
             return result
 
@@ -167,18 +228,50 @@ class Vehicle:
     def end(self) -> None:
         """End the stream; the map stays."""
         with self._lock:
+            self._check()
             self._core.end()
-            self._publish()
+            self._hand_over()
 
     def wait_for_room(self, timeout_s: float | None = None) -> bool:
         """Wait until fewer than `publish.window` messages are unacknowledged. False after the timeout."""
-        with self._lock:
-            return self._acknowledged.wait_for(lambda: not self._core.outbox.full, timeout_s)
+        return self._wait_for(lambda: not self._core.crowded, timeout_s)
 
     def wait_until_acknowledged(self, timeout_s: float | None = None) -> bool:
-        """Wait until the stream has ended and a fusion node holds all of it. False after the timeout."""
+        """Wait until the stream has ended and every required node holds all of it, or takes no more of it.
+
+        False after the timeout.
+        """
+        return self._wait_for(lambda: self._core.done, timeout_s)
+
+    def _wait_for(self, condition: Callable[[], bool], timeout_s: float | None) -> bool:
         with self._lock:
-            return self._acknowledged.wait_for(lambda: self._core.done, timeout_s)
+            met = self._acknowledged.wait_for(lambda: self._failure is not None or condition(), timeout_s)
+            self._check()
+            return met
+
+    @property
+    def fault(self) -> str:
+        """Why a fusion node takes no more of this vehicle, "" where none has said so."""
+        return self._core.fault
+
+    @property
+    def started(self) -> bool:
+        """Whether there is anything yet; a resumed vehicle has started."""
+        return self._core.outbox.last >= 0
+
+    @property
+    def ended(self) -> bool:
+        return self._core.ended
+
+    @property
+    def steps(self) -> int:
+        """Steps taken so far; after a restart those that were committed."""
+        return self._core.steps
+
+    @property
+    def time_s(self) -> float:
+        """Time of the last step, -inf before any. After a restart go on with the reading after that."""
+        return self._core.time_s
 
     @property
     def pose(self) -> Floats:
@@ -210,10 +303,11 @@ class Vehicle:
         return self._core.counters
 
     def close(self) -> None:
-        """Stop the thread. The bus is the caller's to close."""
+        """Commit what is left and stop the thread. Bus and store are the caller's to close."""
         if self._thread is not None:
-            self._acks.put(None)
-            self._thread.join()
+            with contextlib.suppress(queue.Full):
+                self._acks.put(None, timeout=CLOSE_S)
+            self._thread.join(CLOSE_S)
             self._thread = None
 
     def __enter__(self) -> "Vehicle":
