@@ -10,6 +10,7 @@
 6. Times are this node's own monotonic clock; nothing compares them with another's.
 """
 
+import contextlib
 import logging
 from collections import Counter
 from dataclasses import dataclass, field
@@ -84,6 +85,7 @@ class Link:
     asking_until_s: float | None = None
     ask_nodes: bool = False
     next_at_ask: int = 0
+    compare_from: int = 0
     repaired: int = 0
 
 
@@ -142,11 +144,21 @@ class FusionCore:
             self.changed = True
             link.repaired += repair
             link.gap_since_s, link.wait_s = None, self._settings.repair_after_s
+        elif receipt is Receipt.PARKED:
+            self._expect_continued(stream)
         elif receipt in (Receipt.REFUSED, Receipt.DROPPED):
             self.changed = True
             reason = stream.quarantine or "beyond a limit, or not what is held"
             self._count(f"messages_{receipt.name.lower()}", vehicle, reason)
         return self._acknowledge(stream, link, now_s) + self._repair(stream, link, now_s)
+
+    def _expect_continued(self, stream: Stream) -> None:
+        """A hello that waits says how far the epoch went that it continues."""
+        hello = stream.parked[0].message.hello if 0 in stream.parked else None
+        if hello is not None and hello.continues is not None:
+            with contextlib.suppress(WireError):  # no more epochs are taken
+                before = self._link(self.ledger.stream(stream.vehicle, hello.continues.epoch))
+                before.announced = max(before.announced, hello.continues.last)
 
     def on_heartbeat(self, vehicle: str, data: bytes, now_s: float) -> list[Effect]:
         """A heartbeat."""
@@ -197,7 +209,26 @@ class FusionCore:
             link.elsewhere = max(link.elsewhere, position.last)
             ask = ask or position.evidence not in (b"", stream.evidence_id)
             effects += self._repair(stream, link, now_s)
+            if position.last == stream.next - 1 and position.prefix_digest != stream.prefix_digest:
+                effects.append(self._compare(stream, link))
         return [*effects, AskEvents(node)] if ask else effects
+
+    def _compare(self, stream: Stream, link: Link) -> AskRange:
+        """Two nodes hold different messages for the same numbers: fetch what the others hold, a part at a time. Where
+        it differs it is proof against the vehicle."""
+        self._count("forks", stream.vehicle, f"nodes hold different messages up to {stream.next - 1}")
+        first = link.compare_from if link.compare_from < stream.next else 0
+        link.compare_from = first + self._settings.repair_batch
+        request = self._request(stream, first, stream.next - 1)
+        return AskRange(stream.vehicle, stream.epoch, request, nodes=True)
+
+    def _request(self, stream: Stream, first: int, last: int) -> bytes:
+        self.counters["queries"] += 1
+        request = RangeRequest(
+            fleet=self.ledger.fleet, vehicle=stream.vehicle, epoch=stream.epoch, first=first, last=max(first, last),
+            count=self._settings.repair_batch,
+        )  # fmt: skip
+        return encode_range(request, self._signer)
 
     def on_events(self, node: str, data: bytes) -> list[Effect]:
         """One event or one piece of evidence of another node."""
@@ -344,17 +375,8 @@ class FusionCore:
             return []
         last = min(stream.parked) - 1 if stream.parked else wanted
         link.asking_until_s, link.next_at_ask = now_s + QUERY_LOST_S, stream.next
-        request = RangeRequest(
-            fleet=self.ledger.fleet,
-            vehicle=stream.vehicle,
-            epoch=stream.epoch,
-            first=stream.next,
-            last=max(last, stream.next),
-            count=self._settings.repair_batch,
-        )
-        self.counters["queries"] += 1
         nodes = bool(self._peers) and (link.ask_nodes or link.elsewhere > link.announced)
-        return [AskRange(stream.vehicle, stream.epoch, encode_range(request, self._signer), nodes)]
+        return [AskRange(stream.vehicle, stream.epoch, self._request(stream, stream.next, last), nodes)]
 
     def states(self, now_s: float) -> tuple[VehicleState, ...]:
         """Every stream that is known, by vehicle and epoch."""
@@ -383,9 +405,11 @@ class FusionCore:
 
     @property
     def complete(self) -> bool:
-        """Whether the newest epoch of every expected vehicle is over: ended and folded, or quarantined."""
-        newest: dict[str, Stream] = {}
-        for _, stream in sorted(self.ledger.streams.items()):
-            if stream.next > 0 or stream.parked:
-                newest[stream.vehicle] = stream
-        return 0 < self._expected <= sum(stream.over for stream in newest.values())
+        """Whether as many vehicles as expected are over."""
+        vehicles = {vehicle for vehicle, _ in self.ledger.streams}
+        return 0 < self._expected <= sum(self.over(vehicle) for vehicle in vehicles)
+
+    def over(self, vehicle: str) -> bool:
+        """Whether the newest epoch of a vehicle is over: ended and folded, or quarantined."""
+        streams = [s for s in self.ledger.streams.values() if s.vehicle == vehicle and (s.next > 0 or s.parked)]
+        return bool(streams) and max(streams, key=lambda s: s.epoch).over

@@ -16,7 +16,7 @@ from fleet_seif.bus import open_bus
 from fleet_seif.errors import NumericalError, RunError
 from fleet_seif.messages import check_name
 from fleet_seif.warm_up import warm_up
-from scenarios import children, output, tools, watch
+from scenarios import chaos_runs, children, output, tools, watch
 from scenarios.access import Kind
 from scenarios.config import ScenarioError, load_scenario, shipped
 from scenarios.launch import run_processes
@@ -305,6 +305,36 @@ def keys(
     named = {Kind.VEHICLE: vehicle or [], Kind.OPERATOR: operator or [], Kind.VIEWER: viewer or []}
     members = tools.members_of(node or [], endpoint or [], host or [], named)
     tools.make_fleet_keys(folder, fleet, members, days, renew, console)
+
+
+@app.command("chaos")
+@_clear_errors()
+def run_chaos(
+    scenario: ScenarioArgument,
+    seeds: Annotated[str, typer.Option(metavar="A..B", help="Seeds of the faults.")] = "1..100",
+    settings: SetOption = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes to spread them over.")] = 1,
+    every_boundary: Annotated[
+        bool, typer.Option("--every-boundary", help="Kill before every effect of every schedule in turn.")
+    ] = False,
+    schedule: Annotated[str | None, typer.Option(metavar="JSON", help="Run this schedule instead.")] = None,
+) -> None:
+    """Run a scenario many times in one process each, with faults drawn from seeds, and demand the same map."""
+    chosen = load_scenario(scenario, tuple(settings or ()))
+    chaos_runs.seed_range(seeds)
+    warm_up(_say)
+    if schedule is not None:
+        tally = chaos_runs.Arena(chosen).run(chaos_runs.read_schedule(schedule))
+    else:
+        tally = chaos_runs.run_seeds(chosen, chaos_runs.seed_range(seeds), jobs, _say, every_boundary=every_boundary)
+    for seed, reason, least in tally.failures:
+        _say(f"seed {seed}: {reason}\nthe least that fails: fleet-seif chaos {scenario} --schedule '{least}'")
+    _say(
+        f"{tally.seeds} runs, {tally.kills} kills, {tally.boundaries} effects, {tally.virtual_s:.0f} virtual s: "
+        f"{len(tally.failures)} failed"
+    )
+    if tally.failures:
+        raise RunError("something that must always hold did not")
 
 
 def _endpoints(given: list[str] | None, config: Path | None) -> list[str]:

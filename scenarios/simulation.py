@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fleet_seif.errors import NumericalError, ReadingRefused
-from fleet_seif.link import LinkModel
+from fleet_seif.link import LinkModel, LinkSettings
 from fleet_seif.messages import Epoch
 from fleet_seif.store import MemoryStore
 from fusion.core import AskEvents, AskRange, Effect, FusionCore, PutAck, PutStatus
@@ -50,6 +50,7 @@ class Process:
         self.up = False
         self.starts = 0
         self.clock_offset_s = 0.0
+        self.wiped = False
         self._simulation = simulation
         self._paused_until_s = 0.0
         self._rng = rng
@@ -73,7 +74,7 @@ class Process:
             self.up = False
             self._die()
         if wipe:
-            self.disk = MemoryStore()
+            self.disk, self.wiped = MemoryStore(), True
         self._simulation.at(self._simulation.now_s + down_s, self.boot)
 
     def pause(self, for_s: float) -> None:
@@ -253,6 +254,7 @@ class SimNode(Process):
         scenario, simulation = self._simulation.scenario, self._simulation
         self.core = FusionCore(scenario.fleet.name, self.name, scenario.fusion, expected=len(simulation.vehicles))
         self.core.ledger.restore(self.disk.load())
+        simulation.on_boot(self)
         self._effects, self._flushing = [], False
         self.later(FUSION_TICK_S, self._tick)
 
@@ -366,6 +368,7 @@ class Simulation:
         self.boundaries = 0
         self.on_step: Callable[[str, int], None] = lambda vehicle, step: None
         self.on_event: Callable[[SimNode], None] = lambda node: None
+        self.on_boot: Callable[[SimNode], None] = lambda node: None
         self.on_ack_put: Callable[[SimNode, bytes], None] = lambda node, data: None
         self._events: list[tuple[float, int, Action]] = []
         self._order = itertools.count()
@@ -397,6 +400,13 @@ class Simulation:
     def at(self, when_s: float, action: Action) -> None:
         """Do something at a virtual time."""
         heapq.heappush(self._events, (when_s, next(self._order), action))
+
+    def calm(self) -> None:
+        """From now on links are perfect and nobody is killed; who is down comes up."""
+        self.kill_at = frozenset()
+        for process in self.processes.values():
+            process.outward = LinkModel(LinkSettings(), np.random.default_rng(0), process.name)
+            process.boot()
 
     def boundary(self, process: Process) -> None:
         """Between two effects of a process: the place to kill it."""

@@ -378,10 +378,10 @@ class VehicleCore:
                     self._acknowledge(outbox, ack)
 
     def _acknowledge(self, outbox: Outbox, ack: Ack) -> None:
+        if ack.fault:
+            self.fault = f"{ack.node}: {ack.fault}"
         if not outbox.acknowledge(ack.node, ack.last, ack.prefix_digest):
             self.counters.acks_refused += 1
-        elif ack.fault:
-            self.fault = f"{ack.node}: {ack.fault}"
 
     def on_range(self, data: bytes) -> list[bytes]:
         """Answer to a range query: messages of an outbox, or nothing."""
