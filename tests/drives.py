@@ -11,6 +11,7 @@ from fleet_seif.information import FrameDelta, FrameTotal
 from fleet_seif.messages import Epoch
 from fleet_seif.models import COMPASS_XY, RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
+from fleet_seif.store import Store
 from tests import reference
 from vehicles.core import Identity, VehicleCore
 
@@ -105,6 +106,20 @@ def core_of(vehicle: str, start_pose: Floats, fleet: str = FLEET, model: int = R
     return VehicleCore(identity, FilterSettings(active_max=4), PublishSettings(window=10_000), model)
 
 
+def commit(core: VehicleCore, store: Store | None = None) -> None:
+    """What a vehicle does before it puts anything."""
+    changes, mark = core.take_changes()
+    if store is not None:
+        store.commit(changes)
+    core.note_commit(mark)
+
+
+def put(core: VehicleCore, store: Store | None = None) -> list[bytes]:
+    """Everything that a vehicle has to put now."""
+    commit(core, store)
+    return core.release()
+
+
 @cache
 def streams(steps: int = 12) -> dict[str, tuple[bytes, ...]]:
     """What three vehicles publish that drive among the same landmarks: hello, one message a step, the end."""
@@ -118,7 +133,7 @@ def streams(steps: int = 12) -> dict[str, tuple[bytes, ...]]:
         for each in log.readings:
             core.step(each)
         core.end()
-        published[vehicle] = tuple(core.release())
+        published[vehicle] = tuple(put(core))
     return published
 
 

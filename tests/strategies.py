@@ -1,5 +1,6 @@
 """What hypothesis draws: numbers, matrices, deltas, messages and whole streams. Real values, so that cases shrink."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -8,20 +9,25 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from hypothesis.strategies import SearchStrategy
 
-from fleet_seif.information import QUANTA_MAX, VARIABLE_MAX, FrameDelta, block_size, row_offsets
+from fleet_seif.information import H_QUANTUM, QUANTA_MAX, VARIABLE_MAX, FrameDelta, block_size, row_offsets
 from fleet_seif.messages import (
     Ack,
+    Action,
     Continues,
     DeltaMessage,
     Epoch,
+    Evidence,
     FramePart,
     FrameStatus,
     Heartbeat,
     Hello,
     JointMap,
     LandmarkName,
+    NodeStatus,
+    OperatorEvent,
     RangeRequest,
     Snapshot,
+    StreamPosition,
     VehicleState,
 )
 from fleet_seif.records import Floats, Ints
@@ -117,8 +123,8 @@ def hellos() -> SearchStrategy[Hello]:
         placed=st.booleans(),
         start_pose=table(3),
         start_pose_cov=covariances(),
-        sighting_information_max=st.floats(1e-3, 1e12),
-        sightings_max=st.integers(1, 2**20),
+        start_information=st.floats(1e-3, 1e9),
+        step_information_max=st.floats(1e-3, 1e9),
         continues=st.one_of(st.none(), continues),
     )
 
@@ -148,22 +154,71 @@ def messages(draw: st.DrawFn, first: SearchStrategy[int] = st.one_of(st.just(0),
 
 
 def snapshots() -> SearchStrategy[Snapshot]:
-    return st.builds(Snapshot, message=messages(st.just(0)), prefix_digest=DIGESTS)
+    return st.builds(Snapshot, message=messages(st.just(0)), prefix_digest=DIGESTS, maker=st.one_of(st.just(""), NAMES))
 
 
-def heartbeats() -> SearchStrategy[Heartbeat]:
-    return st.builds(Heartbeat, vehicle=NAMES, epoch=EPOCHS, last=SEQUENCES, prefix_digest=DIGESTS, ended=st.booleans())
+@st.composite
+def heartbeats(draw: st.DrawFn) -> Heartbeat:
+    last = draw(SEQUENCES)
+    return Heartbeat(
+        fleet=draw(NAMES),
+        vehicle=draw(NAMES),
+        epoch=draw(EPOCHS),
+        last=last,
+        prefix_digest=draw(DIGESTS),
+        checked=draw(st.integers(-1, last)),
+        checked_digest=draw(DIGESTS),
+        ended=draw(st.booleans()),
+    )
 
 
 def acks() -> SearchStrategy[Ack]:
-    return st.builds(Ack, node=NAMES, vehicle=NAMES, epoch=EPOCHS, last=SEQUENCES, prefix_digest=DIGESTS)
+    return st.builds(
+        Ack, fleet=NAMES, node=NAMES, vehicle=NAMES, epoch=EPOCHS, last=SEQUENCES, prefix_digest=DIGESTS,
+        fault=st.text(max_size=200),
+    )  # fmt: skip
 
 
 @st.composite
 def ranges(draw: st.DrawFn) -> RangeRequest:
     first = draw(SEQUENCES)
     last, count = draw(st.integers(first, 2**53)), draw(st.integers(1, 4096))
-    return RangeRequest(epoch=draw(EPOCHS), first=first, last=last, count=count)
+    return RangeRequest(fleet=draw(NAMES), vehicle=draw(NAMES), epoch=draw(EPOCHS), first=first, last=last, count=count)
+
+
+def landmark_names() -> SearchStrategy[LandmarkName]:
+    return st.builds(LandmarkName, NAMES, st.integers(0, VARIABLE_MAX), st.integers(0, VARIABLE_MAX))
+
+
+@st.composite
+def events(draw: st.DrawFn) -> OperatorEvent:
+    action = draw(st.sampled_from(Action))
+    about_landmarks = action in (Action.FORCE, Action.FORBID, Action.RELEASE)
+    pair = sorted(draw(st.lists(landmark_names(), min_size=2, max_size=2, unique=True))) if about_landmarks else None
+    return OperatorEvent(
+        fleet=draw(NAMES),
+        number=draw(st.integers(1, 2**53)),
+        operator=draw(NAMES),
+        action=action,
+        landmarks=None if pair is None else (pair[0], pair[1]),
+        vehicle="" if about_landmarks else draw(NAMES),
+    )
+
+
+def evidences() -> SearchStrategy[Evidence]:
+    return st.builds(Evidence, first=st.binary(max_size=80), second=st.binary(max_size=80))
+
+
+def statuses() -> SearchStrategy[NodeStatus]:
+    last = st.integers(-1, 2**53)
+    position = st.builds(StreamPosition, NAMES, EPOCHS, last, DIGESTS, st.one_of(st.just(b""), DIGESTS))
+    return st.builds(
+        NodeStatus,
+        fleet=NAMES,
+        node=NAMES,
+        streams=st.lists(position, max_size=3).map(tuple),
+        events=st.lists(st.tuples(st.integers(1, 2**53), NAMES), max_size=3).map(tuple),
+    )
 
 
 def states() -> SearchStrategy[VehicleState]:
@@ -174,6 +229,7 @@ def states() -> SearchStrategy[VehicleState]:
         life=st.integers(0, VARIABLE_MAX),
         epoch=EPOCHS,
         cut=count,
+        checked=count,
         behind=count,
         parked=count,
         duplicates=count,
@@ -183,17 +239,18 @@ def states() -> SearchStrategy[VehicleState]:
         ended=st.booleans(),
         placed=st.booleans(),
         healthy=st.booleans(),
+        fault=st.text(max_size=200),
     )
 
 
 @st.composite
 def maps(draw: st.DrawFn) -> JointMap:
     n, v = draw(st.integers(0, 3)), draw(st.integers(0, 2))
-    name = st.builds(LandmarkName, NAMES, st.integers(0, VARIABLE_MAX), st.integers(0, 2**31))
-    groups = st.lists(name, max_size=2).map(tuple)
+    groups = st.lists(landmark_names(), max_size=2).map(tuple)
     signature = st.integers(-1, 2**63 - 1)
     return JointMap(
         fleet=draw(NAMES),
+        node=draw(NAMES),
         version=draw(SEQUENCES),
         canonical=draw(st.booleans()),
         final=draw(st.booleans()),
@@ -212,31 +269,73 @@ def maps(draw: st.DrawFn) -> JointMap:
     )
 
 
+STRONG = 2**40
+"""Quanta on the diagonal of what a stream sees for the first time: everything else together is less."""
+WEAK = 2**30
+STEP_INFORMATION = 5000.0
+"""More than a message of `streams` adds to a diagonal, per m^2 or rad^2: (STRONG + WEAK) 2^-28 = 4100."""
+
+
+@st.composite
+def definite_deltas(draw: st.DrawFn, known: int, seen: set[int]) -> FrameDelta:
+    """A delta of a frame that stays positive definite. seen: the frame's variables so far; new ones are added to it."""
+    chosen = sorted(draw(st.sets(st.integers(0, known), max_size=3)) | (set() if seen else {0}))
+    pairs = [(i, j) for i in range(len(chosen)) for j in range(i, len(chosen))]
+    kept = [(i, j) for i, j in pairs if i == j or draw(st.booleans())]
+    weak = st.integers(-WEAK, WEAK)
+    H: list[int] = []
+    for i, j in kept:
+        size = block_size(chosen[i], chosen[j])
+        block = draw(st.lists(weak, min_size=size, max_size=size))
+        if i == j and chosen[i] not in seen:
+            for at in {3: (0, 2), 6: (0, 3, 5)}[size]:
+                block[at] += STRONG
+        H += block
+    seen |= set(chosen)
+    rows = int(row_offsets(np.array(chosen, np.int64))[-1])
+    return FrameDelta(
+        variables=np.array(chosen, np.int64),
+        rows=np.array([i for i, _ in kept], np.int64),
+        cols=np.array([j for _, j in kept], np.int64),
+        H=np.array(H, np.int64),
+        b=np.array(draw(st.lists(st.integers(-(2**50), 2**50), min_size=rows, max_size=rows)), np.int64),
+    )
+
+
 @st.composite
 def streams(draw: st.DrawFn, fleet: str = "test", vehicle: str = "v") -> list[DeltaMessage]:
-    """A stream of several frames as a vehicle may publish it: frames open, go on, end, and are corrected later."""
+    """A stream of several frames as a vehicle may publish it: frames open, go on, end, and are corrected later.
+
+    What has been said of a frame is positive definite at any moment, and within what the hello declares.
+    """
     out: list[DeltaMessage] = []
     known, frame = 0, 0
-    hello = draw(hellos())
+    seen: list[set[int]] = [set()]
+    hello = dataclasses.replace(
+        draw(hellos()), continues=None, step_information_max=draw(st.floats(STEP_INFORMATION, 1e9))
+    )
     count = draw(st.integers(1, 6))
     for k in range(count):
         new = draw(st.integers(0, 2))
         landmarks = tuple((known + i, draw(st.integers(-1, 5))) for i in range(new))
         known += new
-        delta = deltas(variable_max=known, bound=2**50)
         mine: list[FramePart] = []
         if k == 0:
-            mine.append(FramePart(frame=0, status=FrameStatus.OPENED, delta=draw(delta)))
+            mine.append(FramePart(frame=0, status=FrameStatus.OPENED, delta=draw(definite_deltas(known, seen[0]))))
         elif draw(st.booleans()):
-            mine.append(FramePart(frame=frame, status=FrameStatus.CONTINUED, delta=draw(delta)))
+            delta = draw(definite_deltas(known, seen[frame]))
+            mine.append(FramePart(frame=frame, status=FrameStatus.CONTINUED, delta=delta))
         else:
-            end = draw(table(3))
-            mine.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=draw(delta), end_pose=end))
+            end, delta = draw(table(3)), draw(definite_deltas(known, seen[frame]))
+            mine.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=delta, end_pose=end))
             frame += 1
-            mine.append(FramePart(frame=frame, status=FrameStatus.OPENED, delta=draw(delta)))
+            seen.append(set())
+            delta = draw(definite_deltas(known, seen[frame]))
+            mine.append(FramePart(frame=frame, status=FrameStatus.OPENED, delta=delta))
         if frame > 0 and draw(st.booleans()):
             old, end = draw(st.integers(0, frame - 1)), draw(table(3))
-            mine.append(FramePart(frame=old, status=FrameStatus.CORRECTED, delta=draw(delta), end_pose=end))
+            delta = draw(definite_deltas(known, seen[old]))
+            mine.append(FramePart(frame=old, status=FrameStatus.CORRECTED, delta=delta, end_pose=end))
         out.append(
             DeltaMessage(
                 fleet=fleet,
@@ -256,6 +355,45 @@ def streams(draw: st.DrawFn, fleet: str = "test", vehicle: str = "v") -> list[De
             )
         )
     return out
+
+
+def pose_block(value: int) -> FrameDelta:
+    """A delta of the pose alone: `value` quanta on its diagonal."""
+    return FrameDelta(
+        variables=np.array([0]), rows=np.array([0]), cols=np.array([0]),
+        H=np.array([value, 0, 0, value, 0, value]), b=np.zeros(3, np.int64),
+    )  # fmt: skip
+
+
+@st.composite
+def broken_streams(draw: st.DrawFn) -> tuple[list[DeltaMessage], int]:
+    """A stream of `streams`, and the number of the one message in it that breaks a rule."""
+    stream = draw(streams())
+    k = draw(st.integers(0, len(stream) - 1))
+    message = stream[k]
+    status = FrameStatus.OPENED if k == 0 else FrameStatus.CONTINUED
+    frames = [part.frame for m in stream[: k + 1] for part in m.parts]
+    names = sum(len(m.landmarks) for m in stream[: k + 1])
+
+    def with_part(delta: FrameDelta) -> dict[str, Any]:
+        return {"parts": (FramePart(frame=max(frames), status=status, delta=delta),)}
+
+    unnamed = dataclasses.replace(
+        pose_block(0), variables=np.array([names + 1]), H=np.ones(3, np.int64), b=np.ones(2, np.int64)
+    )
+    hello = stream[0].hello
+    assert hello is not None
+    most = hello.step_information_max + (hello.start_information if k == 0 else 0.0)
+    changes: list[dict[str, Any]] = [
+        {"landmarks": ((names + 1, 3),)},
+        {"aliases": ((names, 0, True),)},
+        with_part(unnamed),
+        with_part(pose_block(int(most / H_QUANTUM * 1.001) + 1)),
+        {**with_part(pose_block(-2 * STRONG)), "end": True},
+        {"parts": (FramePart(frame=max(frames) + 1, status=status, delta=FrameDelta.nothing()),)},
+    ]
+    stream[k] = dataclasses.replace(message, **draw(st.sampled_from(changes)))
+    return stream, k
 
 
 def msgpack_values() -> SearchStrategy[Any]:

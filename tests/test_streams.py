@@ -10,10 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_seif.information import FrameDelta, delta_digest
-from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus
-from fleet_seif.streams import EMPTY_PREFIX, Coalescer, extend_prefix
+from fleet_seif.messages import Continues, DeltaMessage, Epoch, FramePart, FrameStatus
+from fleet_seif.streams import (
+    CHECK_EVERY,
+    EMPTY_PREFIX,
+    Coalescer,
+    Stop,
+    contradiction,
+    extend_prefix,
+    is_check_point,
+)
 from fleet_seif.wire import decode_message, encode_message
-from fusion.ledger import Ledger, Receipt, Stream
+from fusion.ledger import Ledger, Receipt
+from fusion.stream import Stream
 from tests import strategies
 from tests.drives import streams
 from tests.strategies import settled
@@ -36,24 +45,33 @@ def cut(messages: list[DeltaMessage], cuts: set[int]) -> list[DeltaMessage]:
 
 def folded(messages: list[DeltaMessage]) -> tuple[Ledger, Stream]:
     """A ledger that has taken the bytes of all of them."""
-    ledger = Ledger(messages[0].fleet, parked_max=10)
+    ledger = Ledger(messages[0].fleet)
     for message in messages:
         receipt, stream = ledger.accept(encode_message(message))
         assert receipt is Receipt.FOLDED, stream.fault
     return ledger, stream
 
 
+def end_after(last: DeltaMessage) -> DeltaMessage:
+    """The last message of a stream, which says nothing else; all is checked there."""
+    return dataclasses.replace(
+        last, first=last.last + 1, last=last.last + 1, parts=(), landmarks=(), hello=None, end=True
+    )
+
+
 def effect(messages: list[DeltaMessage]) -> object:
-    """All that folding leaves behind, but for what the bytes themselves were."""
-    ledger, stream = folded(messages)
+    """All that folding leaves behind, but for what the bytes themselves were and where they were checked."""
+    _, stream = folded(messages)
+    checked, _ = folded(messages if messages[-1].end else [*messages, end_after(messages[-1])])
+    assert stream.life is not None
     frames = {
         number: (delta_digest(frame.total.delta()), None if frame.end_pose is None else frame.end_pose.tobytes())
-        for number, frame in stream.frames.items()
+        for number, frame in stream.life.frames.items()
     }
     assert stream.hello is not None
     return (
-        frames, stream.signatures, stream.next, stream.step, stream.times_s[-1], stream.healthy, stream.ended,
-        stream.hello.software, ledger.map_digest(),
+        frames, stream.life.signatures, stream.next, stream.step, stream.times_s[-1], stream.healthy, stream.ended,
+        stream.hello.software, checked.map_digest(),
     )  # fmt: skip
 
 
@@ -100,6 +118,32 @@ def test_health_and_aliases_survive_coalescing(messages: list[DeltaMessage]) -> 
     whole = coalesced(marked)
     assert whole.aliases == tuple((m.first, m.first, True) for m in messages)
     assert not whole.healthy
+
+
+def check_points(messages: list[DeltaMessage]) -> set[int]:
+    return {m.last for m in messages if is_check_point(m)}
+
+
+@given(strategies.streams(), st.lists(st.integers(1, 70), min_size=6, max_size=6), CUTS)
+@settled
+def test_check_points_are_multiples_of_64_and_where_frames_or_the_stream_end(
+    messages: list[DeltaMessage], widths: list[int], cuts: set[int]
+) -> None:
+    """Numbers are stretched, so that the messages cover ranges as coalesced ones do."""
+    expected, first, stretched = set(), 0, []
+    for message, width in zip(messages, widths, strict=False):
+        last = first + width - 1
+        stretched.append(dataclasses.replace(message, first=first, last=last))
+        ends = any(p.status in (FrameStatus.ENDED, FrameStatus.CORRECTED) for p in message.parts)
+        if message.end or ends or any(n % CHECK_EVERY == 0 for n in range(first, last + 1)):
+            expected.add(last)
+        first = last + 1
+    assert check_points(stretched) == expected
+    assert 0 in {m.first for m in stretched if is_check_point(m)}
+    grouped = cut(stretched, cuts)
+    held = {m.last for m in grouped}
+    for point in check_points(stretched):
+        assert min(n for n in held if n >= point) in check_points(grouped)
 
 
 def test_a_frame_that_ended_and_was_corrected_in_one_message_has_ended_there() -> None:
@@ -150,3 +194,56 @@ def test_the_prefix_digest_depends_on_the_order(order: list[int]) -> None:
         return prefix
 
     assert (chained(order) == chained(order[::-1])) == (order == order[::-1])
+
+
+# What contradicts what.
+
+EPOCHS = st.sampled_from([Epoch(1, 5), Epoch(2, 6), Epoch(3, 7)])
+
+
+@st.composite
+def claims(draw: st.DrawFn) -> DeltaMessage:
+    """A message of one of three epochs; a first one may continue another epoch."""
+    epoch = draw(EPOCHS)
+    first = draw(st.integers(0, 4))
+    hello = None
+    if first == 0:
+        other = draw(EPOCHS.filter(lambda e: e != epoch))
+        continues = Continues(epoch=other, last=draw(st.integers(0, 4)), prefix_digest=bytes(32))
+        whole = decode_message(streams()["ann"][0]).hello
+        assert whole is not None
+        hello = dataclasses.replace(whole, continues=draw(st.sampled_from([None, continues])))
+    message = decode_message(streams()["ann"][1])
+    return dataclasses.replace(message, epoch=epoch, first=first, last=first + draw(st.integers(0, 3)), hello=hello)
+
+
+@given(claims(), claims())
+@settings(settled, max_examples=400)
+def test_who_contradicts_whom_does_not_depend_on_the_order(a: DeltaMessage, b: DeltaMessage) -> None:
+    assert contradiction(a, b) == contradiction(b, a)
+    assert contradiction(a, dataclasses.replace(b, vehicle="bob")) is None
+
+
+@given(claims(), claims())
+@settings(settled, max_examples=400)
+def test_a_contradiction_stops_an_epoch_of_one_of_the_two_at_a_number_that_one_of_them_speaks_of(
+    a: DeltaMessage, b: DeltaMessage
+) -> None:
+    """Against a reference: the numbers of each epoch that a message says something about, as (epoch, number)."""
+    stop = contradiction(a, b)
+    if a.epoch == b.epoch:
+        both = set(range(a.first, a.last + 1)) & set(range(b.first, b.last + 1))
+        expected = Stop("ann", a.epoch, min(a.first, b.first)) if both else None
+        assert stop == expected
+        return
+    of = {m.epoch: None if m.hello is None else m.hello.continues for m in (a, b)}
+    if stop is None:
+        continued = [c.epoch for c in of.values() if c is not None]
+        assert len(set(continued)) == len(continued)
+        for m, other in ((a, b), (b, a)):
+            c = of[other.epoch]
+            assert c is None or c.epoch != m.epoch or m.last <= c.last
+    else:
+        limits = [c.last + 1 for c in of.values() if c is not None and c.epoch == stop.epoch]
+        assert limits
+        assert stop.sequence <= min(limits)
