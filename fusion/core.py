@@ -403,6 +403,15 @@ class FusionCore:
             fault=stream.quarantine[:200],
         )
 
+    def waited_for(self, now_s: float) -> bool:
+        """Whether another node that is there lacks something that this one holds."""
+        for peer in self._peers.values():
+            if now_s < peer.heard_s + self._settings.stalled_s:
+                for key, stream in self.ledger.streams.items():
+                    if stream.next - 1 > peer.last.get(key, -1):
+                        return True
+        return False
+
     @property
     def complete(self) -> bool:
         """Whether as many vehicles as expected are over."""
@@ -410,6 +419,9 @@ class FusionCore:
         return 0 < self._expected <= sum(self.over(vehicle) for vehicle in vehicles)
 
     def over(self, vehicle: str) -> bool:
-        """Whether the newest epoch of a vehicle is over: ended and folded, or quarantined."""
+        """Whether the newest epoch of a vehicle is over: ended and folded, or quarantined with nothing more in sight."""
         streams = [s for s in self.ledger.streams.values() if s.vehicle == vehicle and (s.next > 0 or s.parked)]
-        return bool(streams) and max(streams, key=lambda s: s.epoch).over
+        if not streams:
+            return False
+        newest = max(streams, key=lambda s: s.epoch)
+        return newest.over or (newest.stop is not None and self._wanted(newest, self._link(newest)) < newest.next)

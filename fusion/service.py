@@ -5,7 +5,8 @@
    store that fails ends the service.
 3. The solver takes a copy of the totals and works on that; maps in between are skipped.
 4. `run` returns when every expected vehicle has ended and is folded: the last map is solved and marked final, and
-   acknowledgements are repeated until the vehicles have left, for at most `LINGER_S`.
+   acknowledgements are repeated until the vehicles have left and the other nodes have caught up, for at most
+   `LINGER_S`.
 """
 
 import logging
@@ -158,7 +159,7 @@ class FusionService:
                     self._execute(self._core.ack_now(stream))
             self._serve(final=True)
             end_s = self._clock() + LINGER_S
-            while self._alive and self._clock() < end_s and not self._stop.is_set():
+            while not self._stop.is_set() and self._clock() < end_s and self._needed():
                 self._work()
             self._publish()  # once more: pieces of the only final map may have been dropped
         return self.newest
@@ -167,6 +168,10 @@ class FusionService:
     def dropped(self) -> int:
         """Events that came faster than they could be handled, and were dropped."""
         return self._inbox.dropped
+
+    def _needed(self) -> bool:
+        """Whether a vehicle is still there, or another node that lacks what this one holds."""
+        return bool(self._alive) or self._core.waited_for(self._clock())
 
     def stop(self) -> None:
         """Make `run` return."""

@@ -32,6 +32,8 @@ def show_status(
         f"node {joint.node}  map {joint.version}  {len(joint.names)} landmarks  digest {joint.map_digest.hex()[:16]}"
     )
     console.print(watch.vehicle_table(joint.vehicles))
+    for text in watch.faults(joint.vehicles):
+        console.print(text, highlight=False, soft_wrap=True)
     for name, count in joint.counters.items():
         console.print(f"{name} {count}")
 

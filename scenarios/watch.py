@@ -86,35 +86,30 @@ def picture(joint: JointMap) -> RenderableType:
         f"fleet {joint.fleet}  map {joint.version}{' final' if joint.final else ''}  "
         f"{len(joint.names)} landmarks ({shared} shared){deviation}"
     )
-    return Group(Text(head), grid(joint), vehicle_table(joint.vehicles))
+    return Group(Text(head), grid(joint), vehicle_table(joint.vehicles), *map(Text, faults(joint.vehicles)))
 
 
 def vehicle_table(states: Sequence[VehicleState]) -> Table:
     """How every epoch of every vehicle is."""
-    table = Table(box=None)
-    for head in (
-        "vehicle",
-        "life",
-        "epoch",
-        "folded",
-        "behind",
-        "parked",
-        "duplicates",
-        "repaired",
-        "refused",
-        "state",
-    ):
-        table.add_column(head, justify="left" if head in ("vehicle", "state") else "right")
+    table = Table(box=None, padding=(0, 1))
+    heads = ["vehicle", "life", "epoch", "folded", "behind", "parked", "twice", "repaired", "refused", "state"]
+    for head in heads:
+        table.add_column(head, no_wrap=head != "state", justify="left" if head in ("vehicle", "state") else "right")
     for s in states:
         counts = (s.life, s.epoch.counter, s.cut + 1, s.behind, s.parked, s.duplicates, s.gaps_repaired, s.refused)
         table.add_row(s.name, *(str(count) for count in counts), state_words(s, states))
     return table
 
 
+def faults(states: Sequence[VehicleState]) -> list[str]:
+    """Why vehicles are quarantined, a line each."""
+    return [f"{s.name} (epoch {s.epoch.counter}) is quarantined: {s.fault}" for s in states if s.fault]
+
+
 def state_words(s: VehicleState, states: Sequence[VehicleState]) -> str:
     """A state in words. An epoch that stopped short and was followed by one that does not continue it has a gap."""
     if s.fault:
-        return f"quarantined at {s.checked}: {s.fault}"
+        return f"quarantined, stays at {s.checked}"
     later = [other for other in states if other.name == s.name and other.epoch > s.epoch]
     if s.ended:
         words = "ended"

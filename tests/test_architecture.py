@@ -43,7 +43,13 @@ def test_only_the_bus_knows_zenoh() -> None:
     assert users == {"fleet_seif/bus.py"}
 
 
-@pytest.mark.parametrize("core", ["vehicles/core.py", "vehicles/outbox.py", "fusion/core.py", "fusion/ledger.py"])
+CORES = {
+    "vehicles": ("core", "outbox", "records"),
+    "fusion": ("core", "ledger", "life", "stream", "events", "compaction"),
+}
+
+
+@pytest.mark.parametrize("core", [f"{package}/{name}.py" for package, names in CORES.items() for name in names])
 def test_cores_have_no_clock_no_socket_and_no_randomness(core: str) -> None:
     forbidden = {"time", "socket", "threading", "random", "secrets", "asyncio", "queue", "zenoh", "sqlite3"}
     assert not {name.split(".")[0] for name in imported(ROOT / core)} & forbidden

@@ -15,7 +15,10 @@ def test_shipped_scenarios_load_and_describe_themselves(name: str) -> None:
 
 
 def test_the_shipped_scenarios_are_those_of_the_readme() -> None:
-    assert set(shipped()) == {"three_air_vehicles", "three_air_vehicles_mild", "fleet", "lossy_link", "mrclam"}
+    assert set(shipped()) == {
+        "three_air_vehicles", "three_air_vehicles_mild", "fleet", "lossy_link", "mrclam",
+        "crash_restart", "hostile_vehicle", "late_joiner", "partition",
+    }  # fmt: skip
 
 
 def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:

@@ -14,8 +14,9 @@ from scenarios.config import load_scenario
 from scenarios.figure import DPI, SIZE_IN, FigureTimes, Kind, draw_figure, figure_times
 from scenarios.history import Moment, meetings, replay
 from scenarios.recording import Recording
+from scenarios.report import FinishedRun
 from scenarios.source import record
-from scenarios.virtual import VirtualFleet
+from scenarios.virtual import run_virtual
 
 KINDS: tuple[Kind, ...] = ("meetings", "overview")
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -27,17 +28,17 @@ def paper() -> Recording:
 
 
 @cache
-def tiny_run() -> tuple[Recording, VirtualFleet, dict[str, Floats]]:
+def tiny_run() -> tuple[Recording, FinishedRun, dict[str, Floats]]:
     """Few steps of three vehicles among whom some share landmarks."""
     changes = ("fleet.vehicles=3", "world.landmarks=20", "world.steps=12", "run.rate_hz=0")
     scenario = load_scenario("fleet", changes)
     recording = record(scenario)
-    fleet = VirtualFleet(scenario, recording)
-    return recording, fleet, {name: result.pose for name, result in fleet.drive().items()}
+    run = run_virtual("fleet", scenario, recording)
+    return recording, run, {name: drive.pose for name, drive in run.drives.items()}
 
 
 def moments_at(times: FigureTimes) -> list[Moment]:
-    return list(replay(tiny_run()[1].fusion.ledger, times.times_s[-3:]))
+    return list(replay(tiny_run()[1].ledger, times.times_s[-3:]))
 
 
 def draw(path: Path, kind: Kind, recording: Recording, moments: Sequence[Moment] | None = None) -> bytes:

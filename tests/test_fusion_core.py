@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from fleet_seif.config import FilterSettings, FusionSettings, PublishSettings
+from fleet_seif.envelope import KIND_DELTA, KIND_SNAPSHOT, kind_of
 from fleet_seif.messages import Epoch
 from fleet_seif.records import Reading, Sightings
 from fleet_seif.wire import decode_ack, decode_message, decode_range, encode_message
 from fusion.core import AskRange, FusionCore, PutAck
+from tests.drives import put
 from vehicles.core import Identity, VehicleCore
 
 SETTINGS = FusionSettings(repair_after_s=0.1, repair_max_s=0.4, ack_every=4, ack_s=0.05)
@@ -37,7 +39,7 @@ def messages(core: VehicleCore, steps: int, *, end: bool = True) -> list[bytes]:
         )
     if end:
         core.end()
-    return core.release()
+    return put(core)
 
 
 @pytest.fixture
@@ -96,8 +98,7 @@ def test_a_heartbeat_reveals_that_the_last_messages_were_lost(fusion: FusionCore
     core = vehicle()
     data = messages(core, 3)
     fusion.on_delta("v1", data[0], 0.0)
-    heartbeat = core.tick(0.0)
-    assert heartbeat is not None
+    (heartbeat,) = core.tick(0.0)
     fusion.on_heartbeat("v1", heartbeat, 0.5)
     assert [decode_range(e.data).first for e in fusion.tick(0.7) if isinstance(e, AskRange)] == [1]
 
@@ -110,10 +111,9 @@ def test_a_heartbeat_shows_when_a_stream_is_not_what_its_vehicle_sent(fusion: Fu
     for k in range(1, 4):
         other.step(Reading(time_s=float(k), odometry=np.zeros(3), odometry_cov=np.eye(3), sightings=Sightings.none()))
     other.end()
-    other.release()
+    put(other)
     for each, forks in ((core, 0), (other, 1)):
-        heartbeat = each.tick(9.0)
-        assert heartbeat is not None
+        (heartbeat,) = each.tick(9.0)
         fusion.on_heartbeat("v1", heartbeat, 9.0)
         assert fusion.counters["forks"] == forks
 
@@ -123,8 +123,7 @@ def test_a_heartbeat_repeats_an_acknowledgement_that_was_lost(fusion: FusionCore
     for data in messages(core, 3):
         fusion.on_delta("v1", data, 0.0)
     fusion.tick(1.0)
-    heartbeat = core.tick(2.0)
-    assert heartbeat is not None
+    (heartbeat,) = core.tick(2.0)
     (ack,) = [e for e in fusion.on_heartbeat("v1", heartbeat, 2.0) if isinstance(e, PutAck)]
     core.on_ack(ack.data)
     assert core.done
@@ -132,18 +131,20 @@ def test_a_heartbeat_repeats_an_acknowledgement_that_was_lost(fusion: FusionCore
 
 def test_a_node_that_lost_its_memory_catches_up_from_a_snapshot() -> None:
     first, core = FusionCore("f", "node", SETTINGS, expected=1), vehicle()
-    data = messages(core, 10, end=False)
+    data = messages(core, 70, end=False)
     for message in data:
         first.on_delta("v1", message, 0.0)
-    core.on_ack(first.ack_now("v1", Epoch(0, 7)).data)
+    core.on_ack(first.ack_now(first.ledger.stream("v1", Epoch(0, 7))).data)
     core.end()
-    tail = core.release()
+    tail = put(core)
     second = FusionCore("f", "node", SETTINGS, expected=1)
     for message in tail:
         first.on_delta("v1", message, 1.0)
         second.on_delta("v1", message, 1.0)
     (ask,) = [e for e in second.tick(2.0) if isinstance(e, AskRange)]
-    for reply in core.on_range(ask.data):
+    replies = core.on_range(ask.data)
+    assert [kind_of(data) for data in replies[:2]] == [KIND_SNAPSHOT, KIND_DELTA]
+    for reply in replies:
         second.on_reply("v1", reply, 2.0)
     assert second.complete
     assert second.ledger.map_digest() == first.ledger.map_digest()

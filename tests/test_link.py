@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_seif.bus import OnPut, OnQuery
+from fleet_seif.bus import OnPut, OnQuery, Priority
 from fleet_seif.link import FaultyBus, LinkModel, LinkSettings
 from tests.strategies import settled
 
@@ -19,12 +19,13 @@ SHARES = st.floats(0.0, 1.0)
 LINKS = st.builds(
     LinkSettings, delay_s=SECONDS, jitter_s=SECONDS, loss=SHARES, duplication=SHARES, reorder=st.booleans()
 )
+DATA = bytes(range(20))
 SENT = st.lists(SECONDS, max_size=30).map(sorted)
 
 
 def sent_through(settings: LinkSettings, seed: int, times: list[float]) -> list[list[float]]:
     model = LinkModel(settings, np.random.default_rng(seed))
-    return [model.arrivals(t) for t in times]
+    return [[at_s for at_s, data in model.arrivals(t, DATA) if data == DATA] for t in times]
 
 
 @given(LINKS, st.integers(0, 99), SENT)
@@ -70,14 +71,14 @@ def test_only_a_link_without_any_fault_is_perfect(settings: LinkSettings) -> Non
 def test_losses_and_copies_come_as_often_as_asked(loss: float, duplication: float) -> None:
     n = 4000
     model = LinkModel(LinkSettings(loss=loss, duplication=duplication), np.random.default_rng(1))
-    copies = np.array([len(model.arrivals(0.0)) for _ in range(n)])
+    copies = np.array([len(model.arrivals(0.0, DATA)) for _ in range(n)])
     for count, expected in ((copies == 0, loss), (copies == 2, (1.0 - loss) * duplication)):
         assert abs(np.mean(count) - expected) <= 5.0 * np.sqrt(expected * (1.0 - expected) / n)
 
 
 def test_jitter_alone_makes_messages_overtake() -> None:
     model = LinkModel(LinkSettings(jitter_s=1.0), np.random.default_rng(1))
-    arrivals = [at for k in range(50) for at in model.arrivals(0.01 * k)]
+    arrivals = [at for k in range(50) for at, _ in model.arrivals(0.01 * k, DATA)]
     assert arrivals != sorted(arrivals)
 
 
@@ -98,7 +99,7 @@ class Recorder:
         self.handlers: dict[str, OnQuery] = {}
         self.calls: list[str] = []
 
-    def put(self, key: str, payload: bytes) -> None:
+    def put(self, key: str, payload: bytes, priority: Priority = "data") -> None:
         with self.arrived:
             self.puts.append((key, payload))
             self.arrived.notify()

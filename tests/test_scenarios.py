@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from fleet_seif.joint import landmark_classes, solve
-from fusion.mapping import lives_of
+from fleet_seif.joint import solve
 from scenarios.report import Outcome
 from tests import real_data
 from tests.fleets import outcome_of, run_virtual
@@ -99,8 +98,8 @@ def test_bytes_per_step_do_not_grow_with_the_map() -> None:
 
 def test_joint_map_is_solved_from_nothing_to_the_same_bits() -> None:
     run = run_virtual("three_air_vehicles", "world.steps=100")
-    lives = lives_of(run.ledger)
-    first, second = (solve(lives, landmark_classes(lives)) for _ in range(2))
+    lives = run.ledger.lives()
+    first, second = (solve(lives, run.ledger.classes(lives)) for _ in range(2))
     assert np.array_equal(first.mean, second.mean)
     assert np.array_equal(first.H.toarray(), second.H.toarray())
 

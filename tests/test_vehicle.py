@@ -14,6 +14,7 @@ from fusion.core import FusionCore
 from fusion.ledger import Ledger, Receipt
 from fusion.service import FusionService
 from tests.conftest import Network
+from tests.drives import put
 from vehicles import Vehicle
 
 COV = np.diag([1e-4, 1e-8, 1e-4])
@@ -124,8 +125,8 @@ def test_whatever_numbers_a_vehicle_takes_a_node_can_read() -> None:
     vehicle.start(seen, time_s=0)
     for time_s in (1, np.int64(2), np.float32(3.5)):
         vehicle.step([1, 0, 0], np.eye(3), seen, time_s=time_s)  # type: ignore[arg-type]
-    ledger = Ledger("fleet", 4)
-    for data in vehicle._core.release():
+    ledger = Ledger("fleet")
+    for data in put(vehicle._core):
         assert ledger.accept(data)[0] is Receipt.FOLDED
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
 from fleet_seif import envelope, map_wire, wire
-from fleet_seif.envelope import DIGEST, HEADER, MAGIC, PIECE_BYTES, VERSION
+from fleet_seif.envelope import DIGEST, DIGEST_END, HEADER, MAGIC, PIECE_BYTES, VERSION
 from fleet_seif.errors import WireError
 from fleet_seif.information import QUANTA_MAX, VARIABLE_MAX
 from fleet_seif.messages import FrameStatus
@@ -35,27 +35,40 @@ class Kind:
     records: SearchStrategy[Any]
 
 
-PIECES = st.tuples(strategies.SEQUENCES, st.integers(0, 9), st.integers(10, 4096), st.binary(max_size=60))
+PIECES = st.builds(
+    map_wire.Piece, node=strategies.NAMES, version=strategies.SEQUENCES, index=st.integers(0, 9),
+    count=st.integers(10, 4096), data=st.binary(max_size=60),
+)  # fmt: skip
+
+
+def encode_piece(p: map_wire.Piece) -> bytes:
+    return envelope.seal(envelope.KIND_PIECE, (p.node, p.version, p.index, p.count, p.data))
+
+
 KINDS = {
     "delta": Kind(envelope.KIND_DELTA, wire.encode_message, wire.decode_message, strategies.messages()),
     "heartbeat": Kind(envelope.KIND_HEARTBEAT, wire.encode_heartbeat, wire.decode_heartbeat, strategies.heartbeats()),
     "ack": Kind(envelope.KIND_ACK, wire.encode_ack, wire.decode_ack, strategies.acks()),
     "range": Kind(envelope.KIND_RANGE, wire.encode_range, wire.decode_range, strategies.ranges()),
     "snapshot": Kind(envelope.KIND_SNAPSHOT, wire.encode_snapshot, wire.decode_snapshot, strategies.snapshots()),
-    "piece": Kind(envelope.KIND_PIECE, lambda p: envelope.seal(envelope.KIND_PIECE, p), map_wire.read_piece, PIECES),
+    "piece": Kind(envelope.KIND_PIECE, encode_piece, map_wire.read_piece, PIECES),
     "map": Kind(envelope.KIND_MAP, map_wire.encode_map, map_wire.decode_map, strategies.maps()),
 }
 RECORDS = st.sampled_from(sorted(KINDS)).flatmap(lambda name: st.tuples(st.just(KINDS[name]), KINDS[name].records))
 
 
 def sealed(kind: int, body: bytes) -> bytes:
-    """A body under a header and digest that are right."""
+    """A body under a header and digest that are right, without a signature."""
     head = MAGIC + bytes([VERSION, kind])
-    return head + hashlib.blake2b(head + body, digest_size=DIGEST).digest() + body
+    return head + hashlib.blake2b(head + body, digest_size=DIGEST).digest() + b"\0" + body
+
+
+def body_of(data: bytes) -> bytes:
+    return data[DIGEST_END + 1 :]
 
 
 def fields_of(data: bytes) -> Any:
-    return msgpack.unpackb(data[HEADER + DIGEST :], strict_map_key=False)
+    return msgpack.unpackb(body_of(data), strict_map_key=False)
 
 
 def refused(decode: Callable[[bytes], Any], data: bytes) -> bool:
@@ -86,7 +99,7 @@ def test_messages_of_a_filter_come_back_as_they_were(vehicle: str) -> None:
 
 
 def test_a_map_without_landmarks_and_vehicles_comes_back() -> None:
-    fields = [["f", 0, True, False, bytes(32), bytes(32)], [b"", b"", -1], [], [], [[], b"", b""], [], {}]
+    fields = [["f", "n", 0, True, False, bytes(32), bytes(32)], [b"", b"", -1], [], [], [[], b"", b""], [], {}]
     joint = map_wire.decode_map(sealed(envelope.KIND_MAP, msgpack.packb(fields)))
     assert joint.landmark_mean.shape == (0, 2)
     assert joint.pose_cov.shape == (0, 3, 3)
@@ -97,8 +110,8 @@ def test_a_map_without_landmarks_and_vehicles_comes_back() -> None:
 def test_the_digest_in_a_message_is_that_of_kind_version_and_body(case: tuple[Kind, Any]) -> None:
     kind, record = case
     data = kind.encode(record)
-    body = data[HEADER + DIGEST :]
-    assert envelope.body_digest(data) == hashlib.blake2b(data[:HEADER] + body, digest_size=DIGEST).digest()
+    assert data[DIGEST_END] == 0
+    assert envelope.body_digest(data) == hashlib.blake2b(data[:HEADER] + body_of(data), digest_size=DIGEST).digest()
 
 
 # Damage.
@@ -207,8 +220,8 @@ NOT_CANONICAL = {
 def test_another_way_to_write_the_same_is_refused(change: Callable[[bytes], bytes]) -> None:
     message = dataclasses.replace(wire.decode_message(streams()["ann"][1]), fleet="r", time_s=0.0)
     data = wire.encode_message(message)
-    body = change(data[HEADER + DIGEST :])
-    if body == data[HEADER + DIGEST :]:
+    body = change(body_of(data))
+    if body == body_of(data):
         body = b"\xdd\x00\x00\x00\x10" + body[3:]
     assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, body))
 
@@ -216,7 +229,7 @@ def test_another_way_to_write_the_same_is_refused(change: Callable[[bytes], byte
 @pytest.mark.parametrize("change", list(NOT_CANONICAL.values())[4:], ids=list(NOT_CANONICAL)[4:])
 def test_msgpack_of_types_that_no_message_has_is_refused(change: Callable[[bytes], bytes]) -> None:
     message = dataclasses.replace(wire.decode_message(streams()["ann"][1]), fleet="r")
-    body = change(wire.encode_message(message)[HEADER + DIGEST :])
+    body = change(body_of(wire.encode_message(message)))
     assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, body))
 
 
@@ -290,6 +303,20 @@ def test_steps_that_wrap_around_to_a_small_variable_are_refused() -> None:
     assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, msgpack.packb(whole)))
 
 
+@pytest.mark.parametrize("field", [5, 6])
+@pytest.mark.parametrize("value", [0.0, -1.0, 1.0000001e9, float("inf"), float("nan"), 1])
+def test_information_that_no_vehicle_may_declare_is_refused(field: int, value: float) -> None:
+    whole = fields_of(streams()["ann"][0])
+    whole[14][field] = value
+    assert refused(wire.decode_message, sealed(envelope.KIND_DELTA, msgpack.packb(whole)))
+
+
+@pytest.mark.parametrize("checked", [-2, 6])
+def test_a_heartbeat_of_a_check_point_that_has_not_been_put_is_refused(checked: int) -> None:
+    fields = ["f", "v", [1, 2], 5, bytes(32), checked, bytes(32), False]
+    assert refused(wire.decode_heartbeat, sealed(envelope.KIND_HEARTBEAT, msgpack.packb(fields)))
+
+
 def test_a_message_above_the_size_limit_is_refused_unread() -> None:
     assert refused(wire.decode_message, MAGIC + bytes([VERSION, envelope.KIND_DELTA]) + bytes(envelope.MESSAGE_MAX))
 
@@ -316,8 +343,9 @@ def test_a_start_covariance_that_is_no_covariance_is_refused(cov: Any) -> None:
 
 
 def test_a_snapshot_starts_at_sequence_zero() -> None:
-    fields = [fields_of(streams()["ann"][1]), bytes(32)]
-    assert refused(wire.decode_snapshot, sealed(envelope.KIND_SNAPSHOT, msgpack.packb(fields)))
+    for k in (0, 1):
+        fields = [fields_of(streams()["ann"][k]), bytes(32), None]
+        assert refused(wire.decode_snapshot, sealed(envelope.KIND_SNAPSHOT, msgpack.packb(fields))) == (k == 1)
 
 
 # Pieces.
@@ -327,10 +355,11 @@ def test_a_snapshot_starts_at_sequence_zero() -> None:
 @settled
 def test_pieces_in_any_order_make_the_whole_again(data: bytes, version: int, order: st.DataObject) -> None:
     whole = data * 500
-    pieces = order.draw(st.permutations([map_wire.read_piece(piece) for piece in map_wire.map_pieces(whole, version)]))
-    assert {(v, count) for v, _, count, _ in pieces} <= {(version, len(pieces))}
-    assert b"".join(chunk for *_, chunk in sorted(pieces, key=lambda piece: piece[1])) == whole
-    assert all(len(chunk) <= PIECE_BYTES for *_, chunk in pieces)
+    encoded = map_wire.map_pieces(whole, "hub", version)
+    pieces = order.draw(st.permutations([map_wire.read_piece(piece) for piece in encoded]))
+    assert {(p.node, p.version, p.count) for p in pieces} <= {("hub", version, len(pieces))}
+    assert b"".join(p.data for p in sorted(pieces, key=lambda p: p.index)) == whole
+    assert all(len(p.data) <= PIECE_BYTES for p in pieces)
 
 
 @given(st.integers(0, 255), st.binary(max_size=10))

@@ -105,7 +105,7 @@ class VehicleCore:
         self.steps = 0
         self.ended = False
         self.healthy = True
-        self.fault = ""
+        self.faults: dict[str, str] = {}
         self.time_s = -math.inf
         self._publish = publish
         self._required, self._signer, self._keys = required, signer, keys
@@ -378,8 +378,8 @@ class VehicleCore:
                     self._acknowledge(outbox, ack)
 
     def _acknowledge(self, outbox: Outbox, ack: Ack) -> None:
-        if ack.fault:
-            self.fault = f"{ack.node}: {ack.fault}"
+        if ack.fault and len(self.faults) < self._publish.nodes_max:
+            self.faults[ack.node] = ack.fault
         if not outbox.acknowledge(ack.node, ack.last, ack.prefix_digest):
             self.counters.acks_refused += 1
 
@@ -409,9 +409,13 @@ class VehicleCore:
     @property
     def crowded(self) -> bool:
         """Whether a vehicle that can wait should wait for acknowledgements; for nodes that take no more it need not."""
-        return self.outbox.full and not self.fault
+        return self.outbox.full and not self.faults
 
     @property
     def done(self) -> bool:
-        """Whether the stream has ended and nothing is to be done: all acknowledged, or no node takes any more."""
-        return self.ended and (bool(self.fault) or all(outbox.done for outbox in self._outboxes))
+        """Whether the stream has ended and every required node (none required: any) holds all or takes no more."""
+        if not self.ended:
+            return False
+        if not self._required:
+            return bool(self.faults) or all(outbox.done for outbox in self._outboxes)
+        return all(node in self.faults or all(box.held_by(node) for box in self._outboxes) for node in self._required)

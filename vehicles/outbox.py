@@ -179,6 +179,10 @@ class Outbox:
             last = max(self._acked.values(), default=-1)
         return max(last, self._trimmed_last)
 
+    def held_by(self, node: str) -> bool:
+        """Whether a node holds everything here."""
+        return max(self._acked.get(node, -1), self._trimmed_last) == self.last
+
     @property
     def done(self) -> bool:
         """Whether everything here has been put and acknowledged."""

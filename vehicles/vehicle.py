@@ -252,7 +252,7 @@ class Vehicle:
     @property
     def fault(self) -> str:
         """Why a fusion node takes no more of this vehicle, "" where none has said so."""
-        return self._core.fault
+        return "; ".join(f"{node}: {reason}" for node, reason in self._core.faults.items())
 
     @property
     def started(self) -> bool:
