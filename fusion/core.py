@@ -98,7 +98,13 @@ class Peer:
 
 
 class FusionCore:
-    """See the rules above. `expected`: vehicles whose streams must end before the run is complete; 0 never ends."""
+    """See the rules above.
+
+    Args:
+        expected: vehicles whose streams must end before the run is complete; 0 never ends.
+
+    `gone` holds the vehicles that have been here and are not; whoever runs the core keeps it.
+    """
 
     def __init__(
         self,
@@ -113,6 +119,7 @@ class FusionCore:
         self.ledger = Ledger(fleet, settings, keys)
         self.counters: Counter[str] = Counter()
         self.changed = False
+        self.gone: set[str] = set()
         self.node = node
         self._keys = keys
         self._signer = signer
@@ -424,4 +431,6 @@ class FusionCore:
         if not streams:
             return False
         newest = max(streams, key=lambda s: s.epoch)
-        return newest.over or (newest.stop is not None and self._wanted(newest, self._link(newest)) < newest.next)
+        link = self._link(newest)
+        in_sight = link.elsewhere if vehicle in self.gone else self._wanted(newest, link)
+        return newest.over or (newest.stop is not None and in_sight < newest.next)

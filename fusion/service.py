@@ -127,6 +127,7 @@ class FusionService:
 
         def note() -> list[Effect]:
             (self._alive.add if alive else self._alive.discard)(name)
+            (self._core.gone.discard if alive else self._core.gone.add)(name)
             return []
 
         self._inbox.put(name, note)

@@ -235,7 +235,7 @@ def run_schedule(
         if wrong:
             raise ChaosError(f"{node.name} holds another sum of {', '.join(wrong)} than a run without faults")
     watcher.check_maps(fleet.nodes["fusion"])
-    done.boundaries, done.virtual_s = fleet.boundaries, fleet.now_s
+    done.boundaries, done.virtual_s = fleet.boundaries, float(fleet.now_s)
     done.kills = sum(process.starts - 1 for process in fleet.processes.values())
     return done
 

@@ -1,0 +1,97 @@
+"""How many messages a fusion node takes in, printed; the limits are those that the README states. Run with -s."""
+
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_seif.config import FilterSettings, FusionSettings, PublishSettings
+from fleet_seif.messages import Epoch
+from fleet_seif.signing import KeyRing, Role, Signer, generate_signer
+from fleet_seif.sqlite_store import SqliteStore
+from fleet_seif.warm_up import warm_up
+from fusion import records
+from fusion.ledger import Ledger, Receipt
+from scenarios.config import load_scenario
+from scenarios.source import record
+from vehicles.core import Identity, VehicleCore
+
+pytestmark = pytest.mark.slow
+GROUP = 256
+STEPS = 2000
+
+
+@cache
+def signers() -> tuple[Signer, ...]:
+    return tuple(generate_signer("f", Role.VEHICLE, f"v{i}") for i in (1, 2, 3))
+
+
+@cache
+def messages(signed: bool) -> list[tuple[str, bytes]]:
+    """What three vehicles publish in 2,000 steps among 50 landmarks, in turn: 1.3 kB a message."""
+    warm_up()
+    scenario = load_scenario("three_air_vehicles_mild", (f"world.steps={STEPS}", "filter.active_max=6"))
+    streams = []
+    for signer, (name, log) in zip(signers(), record(scenario).logs.items(), strict=True):
+        identity = Identity(
+            fleet="f", vehicle=name, epoch=Epoch(1, 1), start_pose=log.start_pose, start_pose_cov=log.start_pose_cov
+        )
+        core = VehicleCore(
+            identity, FilterSettings(active_max=6), PublishSettings(window=10**5), signer=signer if signed else None
+        )
+        core.start(0.0, log.sightings_at(0))
+        for reading in log.readings():
+            core.step(reading)
+        core.end()
+        core.note_commit(core.take_changes()[1])
+        streams.append([(name, data) for data in core.release()])
+    return [each for turn in zip(*streams, strict=True) for each in turn]
+
+
+def rate(run: Callable[[], Iterator[object]]) -> float:
+    """Messages a second, the best of three runs: machines are shared."""
+    seconds = []
+    count = 0
+    for _ in range(3):
+        begin = time.perf_counter()
+        count = sum(1 for _ in run())
+        seconds.append(time.perf_counter() - begin)
+    return count / min(seconds)
+
+
+def folded(ledger: Ledger, signed: bool) -> Iterator[object]:
+    for name, data in messages(signed):
+        receipt, stream = ledger.accept(data, name)
+        assert receipt is Receipt.FOLDED, stream.fault
+        yield receipt
+
+
+def test_twenty_thousand_messages_a_second_are_decoded_validated_and_folded() -> None:
+    plain = rate(lambda: folded(Ledger("f"), False))
+    ring = KeyRing("f", {(Role.VEHICLE, s.name): s.public_key() for s in signers()})
+    signed = rate(lambda: folded(Ledger("f", keys=ring), True))
+    size = np.mean([len(data) for _, data in messages(False)])
+    print(f"decoded, validated, folded, {size:.0f} bytes each: {plain:.0f} a second, signed {signed:.0f}")
+    assert plain > 20_000
+    assert signed > 2_000
+
+
+def test_five_thousand_messages_a_second_are_made_durable(tmp_path: Path) -> None:
+    number = iter(range(100))
+
+    def durable() -> Iterator[object]:
+        store = SqliteStore.open(tmp_path / f"{next(number)}.ledger", records.KIND, records.SCHEMA)
+        ledger = Ledger("f", FusionSettings())
+        for k, receipt in enumerate(folded(ledger, False), start=1):
+            if k % GROUP == 0:
+                store.commit(ledger.take_changes())
+            yield receipt
+        store.commit(ledger.take_changes())
+        store.close()
+
+    found = rate(durable)
+    print(f"folded and durable, {GROUP} a commit: {found:.0f} a second")
+    assert found > 5_000
