@@ -1,5 +1,5 @@
 """The vehicle: a SEIF on its own odometry and sightings, publishing what it learned."""
 
-from vehicles.vehicle import Vehicle
+from vehicles.vehicle import Vehicle, open_store
 
-__all__ = ["Vehicle"]
+__all__ = ["Vehicle", "open_store"]

@@ -9,6 +9,7 @@
 6. Nothing is put before it is committed: `take_changes`, commit, `note_commit`, `release`.
 """
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Iterable
@@ -151,20 +152,24 @@ class VehicleCore:
         kept = dict(stored)
         if not kept:
             return False
-        self._check_store(kept[records.IDENTITY])
+        same = self._check_store(kept[records.IDENTITY], fresh)
         counter = 1 + int.from_bytes(kept[records.COUNTER], "big")
         epoch = Epoch(max(counter, self.identity.epoch.counter), self.identity.epoch.nonce)
         self.identity = dataclasses.replace(self.identity, epoch=epoch)
         self._kept.clear()
         self._outboxes = [self._restored(key, kept) for key in sorted(kept) if key[:1] == records.EPOCH]
+        if fresh:
+            with contextlib.suppress(RunError):  # then the earlier life has no snapshot, only the messages it holds
+                if same:
+                    self._replay(kept)
+                    self.outbox.close(self.filter.published(), self.filter.signatures)
+            self._forget_filter()
+            self._open(self.outbox.record.life + 1)
+            return True
         self._replay(kept)
         last = self.outbox
         if last.last < 0:  # it had not got as far as its hello
             self._open(last.record.life)
-        elif fresh:
-            last.close(self.filter.published(), self.filter.signatures)
-            self._forget_filter()
-            self._open(last.record.life + 1)
         elif last.ended:
             self.ended = True
         else:
@@ -174,7 +179,8 @@ class VehicleCore:
             self._send(time_s=self.time_s, parts=(), hello=self._hello(continues))
         return True
 
-    def _check_store(self, about: bytes) -> None:
+    def _check_store(self, about: bytes, fresh: bool) -> bool:
+        """Whether the store was written with this filter. Raises RunError where nothing can be done with it."""
         fleet, vehicle, model, settings = msgpack.unpackb(about)
         mine = self.identity
         if (fleet, vehicle) != (mine.fleet, mine.vehicle):
@@ -182,11 +188,13 @@ class VehicleCore:
                 f"the store is that of vehicle {vehicle!r} of fleet {fleet!r}, this is {mine.vehicle!r} of "
                 f"{mine.fleet!r}: give each vehicle a store of its own"
             )
-        if (model, settings) != (self.filter.model, self.filter.settings.model_dump_json()):
+        same = bool((model, settings) == (self.filter.model, self.filter.settings.model_dump_json()))
+        if not same and not fresh:
             raise RunError(
                 f"the store was written with other filter settings ({settings}, model {model}): give the same, or begin"
                 " a fresh life"
             )
+        return same
 
     def _restored(self, key: bytes, kept: dict[bytes, bytes]) -> Outbox:
         ordinal = int.from_bytes(key[1:], "big")
@@ -389,10 +397,10 @@ class VehicleCore:
             request = decode_range(data)
         except WireError:
             return []
-        published, signatures = self.filter.published, self.filter.signatures
         for outbox in self._outboxes:
             if outbox.record.epoch == request.epoch:
-                return outbox.answer(request, published, signatures)
+                published = self.filter.published if outbox is self.outbox else None
+                return outbox.answer(request, published, self.filter.signatures)
         return []
 
     def tick(self, now_s: float) -> list[bytes]:

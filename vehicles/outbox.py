@@ -243,19 +243,23 @@ class Outbox:
         self.record = dataclasses.replace(self.record, closed=published, closed_names=tuple(signatures))
         self.changes.append(Put(records.numbered(records.EPOCH, self.ordinal), self.record.pack()))
 
-    def snapshot(self, published: Callable[[], FrameDelta], signatures: Sequence[int]) -> Snapshot | None:
-        """The forgotten prefix as one message; None where nothing has been forgotten yet.
+    def snapshot(self, published: Callable[[], FrameDelta] | None, signatures: Sequence[int]) -> Snapshot | None:
+        """The forgotten prefix as one message; None where nothing has been forgotten yet, or nobody knows it any more.
 
         published, signatures: all that the filter has published in frame 0 so far, and the names in it; a closed
         epoch knows them itself.
         """
-        if self._trimmed is None:
-            return None
         record = self.record
         if record.closed is not None:
-            signatures = record.closed_names
+            whole, signatures = record.closed, record.closed_names
+        elif published is not None:
+            whole = published()
+        else:
+            return None
+        if self._trimmed is None:
+            return None
         total, known = FrameTotal(), len(signatures)
-        total.add(published() if record.closed is None else record.closed)
+        total.add(whole)
         total.subtract(record.base)
         for message in [*(sent.message for sent in self._sent), *(waiting.message for waiting in self._unsent)]:
             known -= len(message.landmarks)
@@ -273,7 +277,7 @@ class Outbox:
         return Snapshot(message=message, prefix_digest=self._trimmed.prefix_digest)
 
     def answer(
-        self, request: RangeRequest, published: Callable[[], FrameDelta], signatures: Sequence[int]
+        self, request: RangeRequest, published: Callable[[], FrameDelta] | None, signatures: Sequence[int]
     ) -> list[bytes]:
         """Messages of a range; where its start has been forgotten, a snapshot first."""
         found = []

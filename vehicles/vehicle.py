@@ -14,6 +14,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import TracebackType
 
 import numpy as np
@@ -27,7 +28,9 @@ from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
 from fleet_seif.seif import StepResult
 from fleet_seif.signing import KeyRing, Signer
+from fleet_seif.sqlite_store import SqliteStore
 from fleet_seif.store import Store
+from vehicles import records
 from vehicles.core import Counters, Identity, VehicleCore
 
 log = logging.getLogger(__name__)
@@ -40,6 +43,11 @@ def symmetric(matrix: ArrayLike) -> Floats:
     """The symmetric part of a matrix, as a new array: rounding leaves covariances a little off."""
     A = np.array(matrix, float)
     return (A + A.T) / 2 if A.ndim == 2 else A
+
+
+def open_store(path: Path | str) -> SqliteStore:
+    """The file that a vehicle is kept in, made where there is none. Close it after the vehicle. Raises StoreError."""
+    return SqliteStore.open(Path(path), records.KIND, records.SCHEMA)
 
 
 class Vehicle:
@@ -80,11 +88,10 @@ class Vehicle:
         signer: Signer | None = None,
         keys: KeyRing | None = None,
     ) -> None:
-        counter = 1 if store is not None else time.time_ns() // 1_000_000
         identity = Identity(
             fleet=fleet,
             vehicle=name,
-            epoch=epoch or Epoch(counter, secrets.randbits(64)),
+            epoch=epoch or Epoch(time.time_ns() // 1_000_000, secrets.randbits(64)),
             start_pose=np.asarray(start_pose, float),
             start_pose_cov=np.zeros((3, 3)) if start_pose_cov is None else symmetric(start_pose_cov),
             life=life,
