@@ -426,7 +426,7 @@ class FusionCore:
         return 0 < self._expected <= sum(self.over(vehicle) for vehicle in vehicles)
 
     def over(self, vehicle: str) -> bool:
-        """Whether the newest epoch of a vehicle is over: ended and folded, or quarantined with nothing more in sight."""
+        """Whether the newest epoch of a vehicle is over: ended and folded, or quarantined and nothing more in sight."""
         streams = [s for s in self.ledger.streams.values() if s.vehicle == vehicle and (s.next > 0 or s.parked)]
         if not streams:
             return False

@@ -92,11 +92,16 @@ class Stream:
         """Where in the log it is."""
         return bisect_right(self.firsts, sequence) - 1
 
+    @property
+    def after_snapshot(self) -> int:
+        """The first number that no snapshot stands for; 0 without a snapshot."""
+        if not self.log or kind_of(self.log[0]) != KIND_SNAPSHOT:
+            return 0
+        return self.firsts[1] if len(self.firsts) > 1 else self.next
+
     def snapshot_covers(self, last: int) -> bool:
         """Whether a snapshot stands for all single messages up to this number."""
-        if not self.log or kind_of(self.log[0]) != KIND_SNAPSHOT:
-            return False
-        return last < (self.firsts[1] if len(self.firsts) > 1 else self.next)
+        return last < self.after_snapshot
 
     def park(self, parked: Parked) -> None:
         self.parked[parked.message.first] = parked

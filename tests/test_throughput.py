@@ -1,5 +1,8 @@
 """How many messages a fusion node takes in, printed; the limits are those that the README states. Run with -s."""
 
+import json
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -95,3 +98,14 @@ def test_five_thousand_messages_a_second_are_made_durable(tmp_path: Path) -> Non
     found = rate(durable)
     print(f"folded and durable, {GROUP} a commit: {found:.0f} a second")
     assert found > 5_000
+
+
+def test_ten_vehicles_at_twenty_hertz_for_a_minute_leave_no_gap_and_a_fresh_map(tmp_path: Path) -> None:
+    settings = ("fleet.vehicles=10", "world.landmarks=170", "world.steps=1200", "run.rate_hz=20")
+    arguments = [part for item in settings for part in ("--set", item)]
+    command = [sys.executable, "-m", "scenarios", "run", "fleet", *arguments, "--out", str(tmp_path), "--quiet"]
+    subprocess.run(command, check=True)
+    report = json.loads((tmp_path / "report.json").read_text())
+    print("10 vehicles at 20 Hz for 60 s:", report["fusion"])
+    assert all(v["deltas_folded"] == v["deltas_published"] and v["parked"] == 0 for v in report["vehicles"].values())
+    assert report["fusion"]["map_behind_s_p99"] < 0.5
