@@ -180,6 +180,9 @@ def run_fusion(
             say({"event": "note", "text": "the ledger is kept in memory only: --store FILE keeps it for a restart"})
         else:
             restore(core, store)
+            held = sum(len(stream.log) for stream in core.ledger.streams.values())
+            if held:
+                say({"event": "note", "text": f"goes on with {held} messages that it has kept"})
         with _listening(place, store) as session, _with_link(session, link, [seed, 1], name, supervision) as bus:
             version = time.time_ns() // 1_000_000  # so that the maps of a node started again count as newer
             service = FusionService(

@@ -240,28 +240,31 @@ def vehicle(
 @app.command("watch")
 @_clear_errors()
 def watch_map(
-    endpoint: Annotated[str | None, typer.Argument(help="A fusion node, tcp/127.0.0.1:7447 by default.")] = None,
+    endpoint: Annotated[list[str] | None, typer.Argument(help="Fusion nodes; tcp/127.0.0.1:7447 by default.")] = None,
     fleet: Annotated[str, typer.Option(help="Name of the fleet.", callback=_fleet_name)] = "fleet",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a map.")] = False,
     config: ConfigOption = None,
     insecure: InsecureOption = False,
+    key_ring: KeyRingOption = None,
 ) -> None:
     """Show the joint map of a fleet as it grows."""
-    endpoints = _endpoints([endpoint] if endpoint else None, config)
-    asyncio.run(watch.watch(endpoints, fleet, as_json, config, insecure, console))
+    source = watch.Source(_endpoints(endpoint, config), fleet, config, insecure, key_ring)
+    asyncio.run(watch.watch(source, as_json, console))
 
 
 @app.command()
 @_clear_errors()
 def status(
-    endpoint: Annotated[str | None, typer.Argument(help="A fusion node, tcp/127.0.0.1:7447 by default.")] = None,
+    endpoint: Annotated[list[str] | None, typer.Argument(help="Fusion nodes; tcp/127.0.0.1:7447 by default.")] = None,
     fleet: Annotated[str, typer.Option(help="Name of the fleet.", callback=_fleet_name)] = "fleet",
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
     config: ConfigOption = None,
     insecure: InsecureOption = False,
+    key_ring: KeyRingOption = None,
 ) -> None:
     """Say once how every vehicle of a fleet is, and why one is quarantined."""
-    tools.show_status(_endpoints([endpoint] if endpoint else None, config), fleet, as_json, config, insecure, console)
+    source = watch.Source(_endpoints(endpoint, config), fleet, config, insecure, key_ring)
+    tools.show_status(source, as_json, console)
 
 
 @ledger.command()

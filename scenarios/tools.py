@@ -20,11 +20,9 @@ from scenarios.access import Kind, Member
 from scenarios.keys import make_keys
 
 
-def show_status(
-    endpoints: list[str], fleet: str, as_json: bool, config: Path | None, insecure: bool, console: Console
-) -> None:
+def show_status(source: watch.Source, as_json: bool, console: Console) -> None:
     """Print how every vehicle of a fleet is, as a fusion node sees it. Raises RunError where no map comes."""
-    joint = asyncio.run(watch.newest_map(endpoints, fleet, config, insecure))
+    joint = asyncio.run(watch.newest_map(source))
     if as_json:
         console.print_json(json.dumps(watch.as_dict(joint)))
         return

@@ -3,6 +3,8 @@
 import asyncio
 import json
 from collections.abc import Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,36 +14,50 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from fleet_seif.client import connect
+from fleet_seif.client import FleetClient, connect
 from fleet_seif.errors import RunError
 from fleet_seif.messages import JointMap, VehicleState
+from fleet_seif.signing import load_key_ring
 
 FIRST_S = 10.0
 GRID_ROWS = 22
 GRID_COLUMNS = 72
 
 
-async def watch(
-    endpoints: list[str], fleet: str, as_json: bool, config: Path | None, insecure: bool, console: Console
-) -> None:
+@dataclass(frozen=True)
+class Source:
+    """Whose maps, and how they are reached. key_ring: a file, where the fleet signs them."""
+
+    endpoints: list[str]
+    fleet: str
+    config: Path | None = None
+    insecure: bool = False
+    key_ring: Path | None = None
+
+    def connect(self) -> AbstractAsyncContextManager[FleetClient]:
+        keys = None if self.key_ring is None else load_key_ring(self.key_ring)
+        return connect(self.endpoints, fleet=self.fleet, config=self.config, insecure=self.insecure, keys=keys)
+
+
+async def watch(source: Source, as_json: bool, console: Console) -> None:
     """Show every map until the run ends, or until interrupted."""
-    async with connect(endpoints, fleet=fleet, config=config, insecure=insecure) as client:
+    async with source.connect() as client:
         if as_json:
             async for joint in client.maps():
                 print(json.dumps(as_dict(joint)), flush=True)  # noqa: T201
             return
-        with Live(Text(f"waiting for the map of fleet {fleet} ..."), console=console) as live:
+        with Live(Text(f"waiting for the map of fleet {source.fleet} ..."), console=console) as live:
             async for joint in client.maps():
                 live.update(picture(joint))
 
 
-async def newest_map(endpoints: list[str], fleet: str, config: Path | None, insecure: bool) -> JointMap:
+async def newest_map(source: Source) -> JointMap:
     """The map that a fusion node serves now. Raises RunError where none comes."""
-    async with connect(endpoints, fleet=fleet, config=config, insecure=insecure) as client:
+    async with source.connect() as client:
         try:
             return await asyncio.wait_for(anext(client.maps()), FIRST_S)
         except TimeoutError:
-            raise RunError(f"no map of fleet {fleet!r} within {FIRST_S:.0f} s: is that its name?") from None
+            raise RunError(f"no map of fleet {source.fleet!r} within {FIRST_S:.0f} s: is that its name?") from None
 
 
 def state_dict(state: VehicleState) -> dict[str, Any]:
@@ -90,20 +106,21 @@ def picture(joint: JointMap) -> RenderableType:
 
 
 def vehicle_table(states: Sequence[VehicleState]) -> Table:
-    """How every epoch of every vehicle is."""
+    """How every epoch of every vehicle is; a vehicle's epochs are numbered as they followed each other."""
     table = Table(box=None, padding=(0, 1))
     heads = ["vehicle", "life", "epoch", "folded", "behind", "parked", "twice", "repaired", "refused", "state"]
     for head in heads:
         table.add_column(head, no_wrap=head != "state", justify="left" if head in ("vehicle", "state") else "right")
     for s in states:
-        counts = (s.life, s.epoch.counter, s.cut + 1, s.behind, s.parked, s.duplicates, s.gaps_repaired, s.refused)
+        epoch = 1 + sum(other.name == s.name and other.epoch < s.epoch for other in states)
+        counts = (s.life, epoch, s.cut + 1, s.behind, s.parked, s.duplicates, s.gaps_repaired, s.refused)
         table.add_row(s.name, *(str(count) for count in counts), state_words(s, states))
     return table
 
 
 def faults(states: Sequence[VehicleState]) -> list[str]:
     """Why vehicles are quarantined, a line each."""
-    return [f"{s.name} (epoch {s.epoch.counter}) is quarantined: {s.fault}" for s in states if s.fault]
+    return [f"{s.name} is quarantined: {s.fault}" for s in states if s.fault]
 
 
 def state_words(s: VehicleState, states: Sequence[VehicleState]) -> str:

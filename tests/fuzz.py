@@ -16,20 +16,35 @@ import logging
 import math
 import multiprocessing
 import random
+import re
 import struct
 import time
-from collections.abc import Callable
+import typing
+from collections.abc import Callable, Iterator
+from functools import cache
+from types import NoneType
 from typing import Any, Final
 
 import msgpack
 import numpy as np
 
-from fleet_seif import wire
+from fleet_seif import map_wire, wire
 from fleet_seif.client import MapAssembler
 from fleet_seif.config import FilterSettings, FusionSettings, PublishSettings
-from fleet_seif.envelope import DIGEST, DIGEST_END, SIGNATURE, SIGNED, VERSION, authenticate
+from fleet_seif.envelope import DIGEST, DIGEST_END, PIECE_BYTES, SIGNATURE, SIGNED, VERSION, authenticate
 from fleet_seif.errors import WireError
-from fleet_seif.messages import Epoch
+from fleet_seif.messages import (
+    DeltaMessage,
+    Epoch,
+    FrameStatus,
+    Heartbeat,
+    JointMap,
+    OperatorEvent,
+    RangeRequest,
+    Snapshot,
+    StreamPosition,
+    VehicleState,
+)
 from fleet_seif.records import Sightings
 from fleet_seif.signing import Role, Signer
 from fleet_seif.varints import VALUE_MAX, decode_ints, encode_ints
@@ -285,8 +300,114 @@ def check_reader(kind: str, data: bytes) -> bool:
         record = what.decode(data)
     except WireError:
         return False
-    assert what.encode(record, None) == unsigned(data), f"{kind}: not canonical: {data.hex()}"
+    assert what.encode(record, None) == unsigned(data), "not canonical"
+    check_types(record, what.record)
+    check_together(record)
     return True
+
+
+hints = cache(typing.get_type_hints)
+COUNT: Final = (-1, 2**53)
+NUMBER: Final = (0, 2**53)
+RANGES: Final = {
+    **dict.fromkeys(("first", "last", "step", "innovation_dof", "refused", "version", "counter"), NUMBER),
+    **dict.fromkeys(("cut", "checked", "behind", "parked", "duplicates", "gaps_repaired", "cov_version"), COUNT),
+    **dict.fromkeys(("life", "frame"), (0, 2**31 - 1)),
+    "count": (1, 4096), "nonce": (0, 2**64 - 1), "signature": (-1, 2**63 - 1), "index": (0, 4095), "number": (0, 2**53),
+}  # fmt: skip
+LOWER: Final = {(StreamPosition, "last"): -1, (VehicleState, "refused"): -1, (OperatorEvent, "number"): 1}
+NAMES: Final = ("fleet", "vehicle", "node", "operator", "name")
+DIGESTS: Final = ("prefix_digest", "checked_digest", "map_digest", "ledger_digest")
+
+
+def check_types(value: Any, hint: Any) -> None:
+    """A value is what its record says; numbers are finite and in range, names are names."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint in (int, bool, str, bytes, float):
+        assert type(value) is hint, f"{value!r} is no {hint}"
+        assert hint is not float or math.isfinite(value), value
+    elif isinstance(value, np.ndarray):
+        assert np.all(np.isfinite(value)), value
+    elif NoneType in args:
+        if value is not None:
+            check_types(value, next(a for a in args if a is not NoneType))
+    elif origin is tuple:
+        each = [args[0]] * len(value) if args[-1] is Ellipsis else args
+        for item, type_ in zip(value, each, strict=True):
+            check_types(item, type_)
+    elif origin is dict:
+        for key, item in value.items():
+            check_types(key, args[0])
+            check_types(item, args[1])
+    else:
+        assert isinstance(value, hint), f"{value!r} is no {hint}"
+        for name in getattr(hint, "__dataclass_fields__", getattr(hint, "_fields", ())):
+            each = getattr(value, name)
+            check_types(each, hints(hint)[name])
+            _check_field(value, name, each)
+
+
+def _check_field(record: Any, name: str, value: Any) -> None:
+    if isinstance(value, int) and name in RANGES:
+        low, high = RANGES[name]
+        assert LOWER.get((type(record), name), low) <= value <= high, (name, value)
+    if name in NAMES and not (isinstance(record, OperatorEvent) and value == ""):
+        assert re.fullmatch(r"[A-Za-z0-9_-]{1,32}", value), (name, value)
+    if name in DIGESTS:
+        assert len(value) == DIGEST, name
+
+
+def check_together(record: Any) -> None:
+    """What fields of one record must be together."""
+    match record:
+        case Snapshot():
+            assert record.message.first == 0
+            check_together(record.message)
+        case DeltaMessage():
+            assert record.first <= record.last
+            assert (record.first == 0) == (record.hello is not None)
+            for part in record.parts:
+                assert (part.status in (FrameStatus.ENDED, FrameStatus.CORRECTED)) == (part.end_pose is not None)
+        case Heartbeat():
+            assert record.checked <= record.last
+        case RangeRequest():
+            assert record.first <= record.last
+        case map_wire.Piece():
+            assert record.index < record.count
+            assert len(record.data) <= PIECE_BYTES
+        case OperatorEvent():
+            assert (record.landmarks is None) != (record.vehicle == "")
+            assert record.landmarks is None or record.landmarks[0] < record.landmarks[1]
+        case JointMap():
+            n, p = len(record.landmark_mean), len(record.pose_mean)
+            assert len(record.names) == len(record.signature) == n
+            assert len(record.poses) == p
+            assert len(record.landmark_cov) in (0, n)
+            assert len(record.pose_cov) in (0, p)
+
+
+def every_field() -> Iterator[tuple[str, bytes]]:
+    """Each node of each golden body replaced by each of `OTHERS`, left out, or there twice; a kind and a message."""
+    for kind, trees in TREES.items():
+        for tree in trees:
+            for body in _variants(tree):
+                yield kind, sealed(KINDS[kind].number, bytes(msgpack.packb(body)), None)
+
+
+OTHERS: Final[tuple[Any, ...]] = (
+    True, -1, 0, 2**31, 2**53 + 1, 2**64 - 1, 1.0, math.nan, math.inf, "", "a/b", "x" * 201, b"", bytes(32), None, [],
+    [0, 0], {},
+)  # fmt: skip
+
+
+def _variants(node: Any) -> Iterator[Any]:
+    yield from OTHERS
+    if isinstance(node, list):
+        for k, each in enumerate(node):
+            yield [*node[:k], *node[k + 1 :]]
+            yield [*node[:k], each, *node[k:]]
+            for other in _variants(each):
+                yield [*node[:k], other, *node[k + 1 :]]
 
 
 def run(seed: int, count: int, each: Callable[[int], None] = lambda done: None) -> dict[str, list[int]]:

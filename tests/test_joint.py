@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from fleet_seif import joint
 from fleet_seif.errors import NumericalError
 from fleet_seif.information import FrameDelta
-from fleet_seif.joint import JointSolution, Life, landmark_chi_square, landmark_classes, marginal_covariances, solve
+from fleet_seif.joint import (
+    JointSolution,
+    Life,
+    Pair,
+    landmark_chi_square,
+    landmark_classes,
+    marginal_covariances,
+    solve,
+)
 from fleet_seif.messages import LandmarkName
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats
 from tests import reference
@@ -174,6 +182,61 @@ def test_the_order_of_lives_changes_neither_classes_nor_the_map(case: Case, data
     sigma = np.sqrt(np.diagonal(marginal_covariances(a)[0], axis1=1, axis2=2))
     assert np.max(np.abs(a.landmark_mean - b.landmark_mean) / sigma) < 1e-3
     assert sorted(a.poses) == sorted(b.poses)
+
+
+def names_in(case: Case) -> list[LandmarkName]:
+    return [name for group in landmark_classes(case.lives) for name in group]
+
+
+@st.composite
+def decided(draw: st.DrawFn) -> tuple[Case, list[Pair], list[Pair]]:
+    """Lives, and pairs of their landmarks (and of one that nobody has) that operators have joined and parted."""
+    case = draw(cases())
+    names = [*names_in(case), LandmarkName("nobody", 0, 0)]
+    pair = st.lists(st.sampled_from(names), min_size=2, max_size=2, unique=True).map(sorted).map(lambda p: (p[0], p[1]))
+    return case, draw(st.lists(pair, max_size=4)), draw(st.lists(pair, max_size=4))
+
+
+@given(decided())
+@settled
+def test_decided_classes_are_a_partition_in_canonical_order_that_parts_what_is_forbidden(
+    decisions: tuple[Case, list[Pair], list[Pair]],
+) -> None:
+    case, forced, forbidden = decisions
+    classes = landmark_classes(case.lives, forced, forbidden)
+    assert sorted(name for group in classes for name in group) == sorted(names_in(case))
+    assert list(classes) == sorted(tuple(sorted(group)) for group in classes)
+    for a, b in forbidden:
+        assert not any(a in group and b in group for group in classes)
+
+
+@given(decided())
+@settled
+def test_decided_classes_are_those_of_joining_one_pair_after_the_other_where_that_is_allowed(
+    decisions: tuple[Case, list[Pair], list[Pair]],
+) -> None:
+    """Against the slow way: forced pairs in their order, then equal signatures; every class is looked at each time."""
+    case, forced, forbidden = decisions
+    plain = landmark_classes(case.lives)
+    equal = sorted((group[0], other) for group in plain for other in group[1:])
+    groups = [{name} for name in names_in(case)]
+    for a, b in [*forced, *equal]:
+        found = [group for group in groups if a in group or b in group]
+        known = any(a in group for group in found) and any(b in group for group in found)
+        if len(found) == 2 and known and not any(x in (found[0] | found[1]) and y in (found[0] | found[1])
+                                                  for x, y in forbidden):  # fmt: skip
+            groups = [group for group in groups if group not in found] + [found[0] | found[1]]
+    assert set(landmark_classes(case.lives, forced, forbidden)) == {tuple(sorted(group)) for group in groups}
+
+
+@given(decided(), st.data())
+@settled
+def test_decisions_do_not_depend_on_the_order_of_lives(
+    decisions: tuple[Case, list[Pair], list[Pair]], data: st.DataObject
+) -> None:
+    case, forced, forbidden = decisions
+    shuffled = data.draw(st.permutations(case.lives))
+    assert landmark_classes(shuffled, forced, forbidden) == landmark_classes(case.lives, forced, forbidden)
 
 
 def test_classes_are_in_the_order_of_their_first_names() -> None:

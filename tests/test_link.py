@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from fleet_seif.bus import OnPut, OnQuery, Priority
-from fleet_seif.link import FaultyBus, LinkModel, LinkSettings
+from fleet_seif.link import Cut, FaultyBus, LinkModel, LinkSettings
 from tests.strategies import settled
 
 SECONDS = st.floats(0.0, 5.0)
@@ -90,6 +90,56 @@ def test_settings_that_mean_nothing_are_refused(field: dict[str, float]) -> None
         LinkSettings.model_validate(field)
 
 
+CUTS = LinkSettings(cuts=(Cut(from_s=1.0, for_s=2.0), Cut(from_s=5.0, for_s=1.0, who=("v1",))))
+
+
+@pytest.mark.parametrize(("who", "cut"), [("v1", [1.0, 2.9, 5.0, 5.9]), ("v2", [1.0, 2.9])])
+def test_a_cut_lets_nothing_through_of_those_whom_it_names_while_it_lasts(who: str, cut: list[float]) -> None:
+    model = LinkModel(CUTS, np.random.default_rng(1), who)
+    times = [0.0, 0.9, 1.0, 2.9, 3.0, 5.0, 5.9, 6.0]
+    assert [t for t in times if model.is_cut(t)] == cut
+    assert [t for t in times if not model.arrivals(t, DATA)] == cut
+    assert [t for t in times if not model.arrivals(99.0, DATA, run_s=t)] == cut
+    assert not CUTS.perfect
+
+
+@given(st.binary(max_size=200), st.integers(0, 99))
+@settled
+def test_damage_changes_a_byte_or_takes_the_end_away(data: bytes, seed: int) -> None:
+    (arrival,) = LinkModel(LinkSettings(corruption=1.0), np.random.default_rng(seed)).arrivals(0.0, data)
+    damaged = arrival.data
+    if len(damaged) == len(data):
+        assert sum(a != b for a, b in zip(damaged, data, strict=True)) == min(1, len(data))
+    else:
+        assert data.startswith(damaged)
+        assert len(damaged) < len(data)
+
+
+def test_damage_comes_as_often_as_asked_and_hits_copies_one_by_one() -> None:
+    n = 2000
+    model = LinkModel(LinkSettings(corruption=0.3, duplication=1.0), np.random.default_rng(1))
+    hurt = [[copy.data != DATA for copy in model.arrivals(0.0, DATA)] for _ in range(n)]
+    assert abs(np.mean(hurt) - 0.3) < 5.0 * np.sqrt(0.21 / (2 * n))
+    assert {tuple(pair) for pair in hurt} == {(a, b) for a in (False, True) for b in (False, True)}
+
+
+def test_a_bus_that_is_cut_neither_puts_nor_hears_nor_asks_nor_answers() -> None:
+    recorder, now_s = Recorder(), [1.5]
+    heard: list[object] = []
+    bus = FaultyBus(recorder, CUTS, seed=3, run_s=lambda: now_s[0])
+    bus.subscribe("s", lambda key, payload: heard.append(payload))
+    bus.answer("q", lambda key, payload: [payload])
+    for cut in (True, False):
+        now_s[0] = 1.5 if cut else 4.0
+        bus.put("k", b"x")
+        recorder.subscribed("s", b"x")
+        bus.ask("q", b"x", heard.append, lambda: heard.append("done"))
+        assert recorder.handlers["q"]("q", b"x") == ([] if cut else [b"x"])
+        assert heard == (["done"] if cut else ["done", b"x", b"x", "done"])
+    assert recorder.wait_for(1) == [("k", b"x")]
+    bus.close()
+
+
 class Recorder:
     """A bus that notes what it is asked to do."""
 
@@ -98,6 +148,7 @@ class Recorder:
         self.arrived = threading.Condition()
         self.handlers: dict[str, OnQuery] = {}
         self.calls: list[str] = []
+        self.subscribed: OnPut = lambda key, payload: None
 
     def put(self, key: str, payload: bytes, priority: Priority = "data") -> None:
         with self.arrived:
@@ -111,6 +162,7 @@ class Recorder:
 
     def subscribe(self, key: str, handler: OnPut) -> None:
         self.calls.append(f"subscribe {key}")
+        self.subscribed = handler
 
     def answer(self, key: str, handler: OnQuery) -> None:
         self.handlers[key] = handler

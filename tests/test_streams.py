@@ -25,6 +25,7 @@ from fusion.ledger import Ledger, Receipt
 from fusion.stream import Stream
 from tests import strategies
 from tests.drives import streams
+from tests.histories import HONEST, MAIN
 from tests.strategies import settled
 
 CUTS = st.sets(st.integers(1, 30))
@@ -144,6 +145,16 @@ def test_check_points_are_multiples_of_64_and_where_frames_or_the_stream_end(
     held = {m.last for m in grouped}
     for point in check_points(stretched):
         assert min(n for n in held if n >= point) in check_points(grouped)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="reported: a correction that is coalesced with its frame's end loses its exemption"
+)
+def test_a_large_correction_is_taken_alone_and_coalesced() -> None:
+    messages = [dataclasses.replace(m) for m in HONEST["ann", MAIN][:5]]
+    huge = dataclasses.replace(messages[4].parts[0], delta=strategies.pose_block(2**50))
+    messages[4] = dataclasses.replace(messages[4], parts=(huge, *messages[4].parts[1:]))
+    assert effect(messages) == effect(cut(messages, {2}))
 
 
 def test_a_frame_that_ended_and_was_corrected_in_one_message_has_ended_there() -> None:
