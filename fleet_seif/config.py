@@ -57,10 +57,11 @@ class FusionSettings(Settings):
     parked_max, parked_bytes_max: early messages of an epoch, and their bytes of a vehicle, that are kept;
     parked_bytes_all_max: of all vehicles; gap_max: numbers that an early message may be ahead. What goes beyond is
     dropped and asked for again.
-    ledger_bytes_max: bytes of messages a node keeps; at compact_bytes it starts to compact.
+    ledger_bytes_max, vehicle_bytes_max: bytes of messages a node keeps, in all and of a vehicle; at compact_bytes it
+    starts to compact.
     required_acks: the fusion nodes that must have acknowledged a message before its vehicle forgets it; none: any one.
     repair_after_s: how long a gap may stand before it is asked for; doubled up to repair_max_s without progress.
-    repair_batch: messages asked for at a time; queries_max: queries under way at a time.
+    repair_batch: messages asked for at a time; queries_max: queries about a vehicle under way at a time.
     status_s: time between two reports to the other nodes.
     ack_every: messages folded before an acknowledgement is sent at once; ack_s: otherwise after this time.
     map_s: least time between two served maps.
@@ -72,13 +73,14 @@ class FusionSettings(Settings):
     parked_bytes_max: Annotated[int, Field(ge=1)] = 64 * 2**20
     parked_bytes_all_max: Annotated[int, Field(ge=1)] = 512 * 2**20
     gap_max: Annotated[int, Field(ge=1)] = 1_000_000
-    ledger_bytes_max: Annotated[int, Field(ge=1)] = 2**30
+    ledger_bytes_max: Annotated[int, Field(ge=1)] = 2**32
+    vehicle_bytes_max: Annotated[int, Field(ge=1)] = 2**30
     compact_bytes: Annotated[int, Field(ge=1)] = 256 * 2**20
     required_acks: tuple[Annotated[str, Field(pattern=rf"^[A-Za-z0-9_-]{{1,{NAME_MAX}}}$")], ...] = ()
     repair_after_s: Positive = 0.1
     repair_max_s: Positive = 2.0
     repair_batch: Annotated[int, Field(ge=1, le=4096)] = 256
-    queries_max: Annotated[int, Field(ge=1, le=10_000)] = 32
+    queries_max: Annotated[int, Field(ge=1, le=10_000)] = 4
     status_s: Positive = 0.5
     ack_every: Annotated[int, Field(ge=1, le=4096)] = 32
     ack_s: Positive = 0.05

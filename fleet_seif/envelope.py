@@ -33,6 +33,7 @@ SEQUENCE_MAX: Final = 2**53
 PIECE_BYTES: Final = 48_000
 PIECES_MAX: Final = 4096
 REPLIES_MAX: Final = 4096
+COUNTERS_MAX: Final = 256
 
 KIND_DELTA: Final = 1
 KIND_HEARTBEAT: Final = 2
@@ -80,7 +81,10 @@ def unseal(kind: int, data: bytes) -> Any:
     """The fields of a message of a kind, as tuples; types and ranges are the caller's to check."""
     _, body = _split(kind, data)
     try:
-        fields = msgpack.unpackb(body, use_list=False, raw=False, strict_map_key=True, max_array_len=ENTRIES_MAX)
+        fields = msgpack.unpackb(
+            body, use_list=False, raw=False, strict_map_key=True, max_array_len=ENTRIES_MAX,
+            max_map_len=COUNTERS_MAX if kind == KIND_MAP else 0, max_ext_len=0,
+        )  # fmt: skip
         canonical = msgpack.packb(fields)
     except Exception as error:  # msgpack raises many kinds, and all of them mean bytes that are not ours
         raise WireError(f"body is not msgpack: {error!r}"[:200]) from None

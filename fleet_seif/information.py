@@ -224,6 +224,8 @@ class FrameTotal:
 
     def add(self, delta: FrameDelta) -> None:
         """Fold one delta. Raises NumericalError, with nothing changed, where a sum would reach 2^60 quanta."""
+        if not len(delta.variables):
+            return
         self._reserve(len(delta.rows) + len(delta.variables), len(delta.H) + len(delta.b))
         if not _apply(
             self._keys, self._offsets, self._values, self._used,

@@ -1,9 +1,10 @@
 """Bytes of the joint map, whole and in pieces; FORMAT.md is the specification."""
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from fleet_seif.envelope import (
+    COUNTERS_MAX,
     ENTRIES_MAX,
     KIND_MAP,
     KIND_PIECE,
@@ -28,8 +29,6 @@ from fleet_seif.errors import WireError
 from fleet_seif.information import VARIABLE_MAX
 from fleet_seif.messages import JointMap, VehicleState
 from fleet_seif.signing import Signer
-
-COUNTERS_MAX: Final = 256
 
 
 def encode_map(joint: JointMap, signer: Signer | None = None) -> bytes:
@@ -93,7 +92,8 @@ def decode_map(data: bytes) -> JointMap:
     fleet, node, version, canonical, final, map_digest, ledger_digest = fields_of(head, 7, "map head")
     mean, cov, cov_version = fields_of(landmarks, 3, "map landmarks")
     pose_names, pose_mean, pose_cov = fields_of(poses, 3, "map poses")
-    if not isinstance(counters, dict) or len(counters) > COUNTERS_MAX or list(counters) != sorted(counters):
+    table = isinstance(counters, dict) and all(isinstance(key, str) for key in counters)
+    if not table or len(counters) > COUNTERS_MAX or list(counters) != sorted(counters):
         raise WireError(f"map counters: expected a table of at most {COUNTERS_MAX}, in order of its keys")
     joint = JointMap(
         fleet=name_of(fleet, "fleet"),

@@ -210,12 +210,12 @@ class StreamPosition(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class NodeStatus:
-    """What a fusion node tells the others: its streams, and the ids of the operator events it holds."""
+    """What a fusion node tells the others: its streams, and a digest of the operator events it holds."""
 
     fleet: str
     node: str
     streams: tuple[StreamPosition, ...]
-    events: tuple[tuple[int, str], ...]
+    events: bytes
 
 
 @dataclass(frozen=True, kw_only=True)

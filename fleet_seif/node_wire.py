@@ -27,7 +27,7 @@ from fleet_seif.errors import WireError
 from fleet_seif.messages import Action, Evidence, NodeStatus, OperatorEvent, StreamPosition
 from fleet_seif.signing import Signer
 
-STREAMS_MAX: Final = 1000
+STREAMS_MAX: Final = 5000
 EVENTS_MAX: Final = 10_000
 ABOUT_LANDMARKS: Final = (Action.FORCE, Action.FORBID, Action.RELEASE)
 
@@ -87,7 +87,7 @@ def decode_status(data: bytes) -> NodeStatus:
         fleet=name_of(fleet, "fleet"),
         node=name_of(node, "node"),
         streams=tuple(_read_position(item) for item in items_of(streams, STREAMS_MAX, "streams")),
-        events=tuple(_read_event_id(item) for item in items_of(events, EVENTS_MAX, "events")),
+        events=digest_of(events, "events"),
     )
 
 
@@ -99,8 +99,3 @@ def _read_position(value: Any) -> StreamPosition:
         name_of(vehicle, "vehicle"), epoch_of(epoch), int_of(last, -1, SEQUENCE_MAX, "last"),
         digest_of(digest, "prefix digest"), evidence,
     )  # fmt: skip
-
-
-def _read_event_id(value: Any) -> tuple[int, str]:
-    number, operator = fields_of(value, 2, "event id")
-    return int_of(number, 1, SEQUENCE_MAX, "event number"), name_of(operator, "operator")

@@ -63,7 +63,9 @@ class Coalescer:
         self._first = first
         self._totals: dict[int, FrameTotal] = {}
         self._opened: set[int] = set()
-        self._ends: dict[int, tuple[FrameStatus, Floats]] = {}
+        self._ends: dict[int, Floats] = {}
+        self._corrections: dict[int, FrameTotal] = {}
+        self._corrected_ends: dict[int, Floats] = {}
         self._landmarks: list[tuple[int, int]] = []
         self._aliases: list[tuple[int, int, bool]] = []
         self._innovation, self._dof, self._refused = 0.0, 0, 0
@@ -78,12 +80,12 @@ class Coalescer:
 
     def _take(self, message: DeltaMessage) -> None:
         for part in message.parts:
-            self._totals.setdefault(part.frame, FrameTotal()).add(part.delta)
+            corrects = part.status is FrameStatus.CORRECTED
+            (self._corrections if corrects else self._totals).setdefault(part.frame, FrameTotal()).add(part.delta)
             if part.status is FrameStatus.OPENED:
                 self._opened.add(part.frame)
             if part.end_pose is not None:
-                status = FrameStatus.ENDED if part.frame in self._ends else part.status
-                self._ends[part.frame] = (status, part.end_pose)
+                (self._corrected_ends if corrects else self._ends)[part.frame] = part.end_pose
         self._landmarks.extend(message.landmarks)
         self._aliases.extend(message.aliases)
         self._innovation += message.innovation
@@ -96,7 +98,8 @@ class Coalescer:
             self._newest,
             first=self._first.first,
             hello=self._first.hello,
-            parts=tuple(part for frame in sorted(self._totals) for part in self._parts(frame)),
+            parts=tuple(part for frame in sorted(self._totals) for part in self._parts(frame))
+            + tuple(self._correction(frame) for frame in sorted(self._corrections)),
             landmarks=tuple(self._landmarks),
             aliases=tuple(self._aliases),
             innovation=self._innovation,
@@ -110,8 +113,13 @@ class Coalescer:
             status = FrameStatus.OPENED if opened else FrameStatus.CONTINUED
             return [FramePart(frame=frame, status=status, delta=delta)]
         if not opened:
-            return [FramePart(frame=frame, status=end[0], delta=delta, end_pose=end[1])]
+            return [FramePart(frame=frame, status=FrameStatus.ENDED, delta=delta, end_pose=end)]
         return [
             FramePart(frame=frame, status=FrameStatus.OPENED, delta=delta),
-            FramePart(frame=frame, status=FrameStatus.ENDED, delta=FrameDelta.nothing(), end_pose=end[1]),
+            FramePart(frame=frame, status=FrameStatus.ENDED, delta=FrameDelta.nothing(), end_pose=end),
         ]
+
+    def _correction(self, frame: int) -> FramePart:
+        """Kept apart: a correction may claim what the steps themselves may not."""
+        delta, end = self._corrections[frame].delta(), self._corrected_ends[frame]
+        return FramePart(frame=frame, status=FrameStatus.CORRECTED, delta=delta, end_pose=end)

@@ -52,6 +52,11 @@ from fleet_seif.signing import Signer
 STATUSES: Final = tuple(FrameStatus)
 CORRELATION_MARGIN: Final = 1e-9
 """Least eigenvalue of a start pose's correlation matrix."""
+VARIANCE_MIN: Final = 1e-12
+VARIANCE_MAX: Final = 1e12
+"""Of a start pose, m^2 and rad^2."""
+POSE_MAX: Final = 1e9
+"""Largest coordinate of a start pose, m and rad."""
 INFORMATION_MAX: Final = 1e9
 """Most information that a vehicle may declare for a frame's first pose or for a step, per m^2 or rad^2."""
 
@@ -91,10 +96,12 @@ def _pack_hello(hello: Hello) -> tuple[object, ...]:
 
 def is_start_covariance(cov: Floats) -> bool:
     """Whether a start pose's covariance is symmetric and clearly positive definite: its inverse becomes a prior."""
-    if not np.array_equal(cov, cov.T):
+    variance = np.diag(cov)
+    if not (np.array_equal(cov, cov.T) and np.all((variance >= VARIANCE_MIN) & (variance <= VARIANCE_MAX))):
         return False
-    scale = np.sqrt(np.maximum(np.diag(cov), 0.0))
-    return bool(np.all(scale > 0) and np.linalg.eigvalsh(cov / np.outer(scale, scale))[0] > CORRELATION_MARGIN)
+    scale = np.sqrt(variance)
+    correlation = cov / np.outer(scale, scale)
+    return bool(np.all(np.abs(correlation) <= 1.0) and np.linalg.eigvalsh(correlation)[0] > CORRELATION_MARGIN)
 
 
 def _read_hello(value: Any) -> Hello:
@@ -106,14 +113,20 @@ def _read_hello(value: Any) -> Hello:
             last=int_of(last, 0, SEQUENCE_MAX, "continues"),
             prefix_digest=digest_of(digest, "prefix"),
         )
+    start_pose = array_of(pose, (3,), "start pose")
+    if np.any(np.abs(start_pose) > POSE_MAX):
+        raise WireError(f"start pose: beyond {POSE_MAX:g} m or rad")
     start_pose_cov = array_of(cov, (3, 3), "start pose covariance")
     if np.any(start_pose_cov) and not is_start_covariance(start_pose_cov):
-        raise WireError("start pose covariance: neither zeros nor symmetric and positive definite")
+        raise WireError(
+            "start pose covariance: neither zeros nor symmetric and positive definite with variances "
+            f"from {VARIANCE_MIN:g} to {VARIANCE_MAX:g}"
+        )
     return Hello(
         software=text_of(software, "software"),
         life=int_of(life, 0, VARIABLE_MAX, "life"),
         placed=bool_of(placed, "placed"),
-        start_pose=array_of(pose, (3,), "start pose"),
+        start_pose=start_pose,
         start_pose_cov=start_pose_cov,
         start_information=_information_of(start, "start information"),
         step_information_max=_information_of(step, "information a step"),

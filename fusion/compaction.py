@@ -1,7 +1,7 @@
 """Forgetting single messages: one snapshot instead of a prefix, with the same totals and the same digest."""
 
 from fleet_seif.envelope import KIND_SNAPSHOT, kind_of
-from fleet_seif.errors import WireError
+from fleet_seif.errors import NumericalError, WireError
 from fleet_seif.messages import Snapshot
 from fleet_seif.signing import Signer
 from fleet_seif.store import Change, Delete, Put
@@ -28,18 +28,23 @@ def compact(stream: Stream, confirmed: int, node: str, signer: Signer | None) ->
     at = next((i for i, first in enumerate(stream.firsts) if first > upto), len(stream.log))
     if upto not in stream.check_digests or upto > confirmed or at < LEAST:
         return []
-    first = stream.log[0]
-    held = decode_snapshot(first).message if kind_of(first) == KIND_SNAPSHOT else decode_message(first)
-    whole = Coalescer(held)
-    for data in stream.log[1:at]:
-        whole.add(decode_message(data))
-    snapshot = Snapshot(message=whole.message(), prefix_digest=stream.check_digests[upto], maker=node)
-    data = encode_snapshot(snapshot, signer)
     try:
+        snapshot = _snapshot(stream.log[:at], stream.check_digests[upto], node)
+        data = encode_snapshot(snapshot, signer)
         decode_snapshot(data)
-    except WireError:  # beyond a limit of the format: its messages stay as they are
+    except (WireError, NumericalError, OverflowError):  # beyond a limit of the format: its messages stay as they are
         return []
     stream.log_bytes += len(data) - sum(len(each) for each in stream.log[:at])
+    stream.voucher = stream.witness
     stream.log[:at], stream.firsts[:at], stream.times_s[:at] = [data], [0], [snapshot.message.time_s]
     low, high = (records.message_key(*stream.key, number) for number in (0, upto + 1))
-    return [Delete(low, high), Put(low, data)]
+    return [Delete(low, high), Put(low, data), Put(records.stream_key(records.VOUCHER, *stream.key), stream.voucher)]
+
+
+def _snapshot(messages: list[bytes], prefix_digest: bytes, node: str) -> Snapshot:
+    """One message for several; the first may be a snapshot itself."""
+    first = messages[0]
+    whole = Coalescer(decode_snapshot(first).message if kind_of(first) == KIND_SNAPSHOT else decode_message(first))
+    for data in messages[1:]:
+        whole.add(decode_message(data))
+    return Snapshot(message=whole.message(), prefix_digest=prefix_digest, maker=node)

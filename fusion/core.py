@@ -4,7 +4,7 @@
 2. Effects say "we hold this": whoever carries them out commits `ledger.take_changes()` to the store first.
 3. A gap is known from a parked message, a heartbeat or the status of another node. It is asked for after
    `repair_after_s`; without progress the wait doubles up to `repair_max_s`, and vehicle and other nodes are asked in
-   turn. One query a stream at a time, `queries_max` in all; a query counts as lost after `QUERY_LOST_S`.
+   turn. One query a stream at a time, `queries_max` a vehicle; a query counts as lost after `QUERY_LOST_S`.
 4. Acknowledgements go out every `ack_every` messages or `ack_s`, and again with every heartbeat.
 5. Nodes tell each other how far they are every `status_s`; evidence and decisions of operators are fetched if unknown.
 6. Times are this node's own monotonic clock; nothing compares them with another's.
@@ -16,7 +16,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from fleet_seif.config import FusionSettings
-from fleet_seif.envelope import KIND_EVENT, KIND_HEARTBEAT, authenticate, kind_of
+from fleet_seif.envelope import KIND_EVENT, KIND_HEARTBEAT, SEQUENCE_MAX, authenticate, kind_of
 from fleet_seif.errors import WireError
 from fleet_seif.messages import Ack, Epoch, NodeStatus, RangeRequest, StreamPosition, VehicleState
 from fleet_seif.node_wire import decode_status, encode_status
@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 QUERY_LOST_S = 4.0
 REPLY_BYTES_MAX = 4 * 2**20
 ANNOUNCED_MAX = 8
+NODES_MAX = 100
 
 
 @dataclass(frozen=True)
@@ -181,9 +182,9 @@ class FusionCore:
             return self._malformed(vehicle, error)
         link = self._link(stream)
         link.heard_s = now_s
-        link.announced = heartbeat.last
-        stream.announced[heartbeat.checked] = heartbeat.checked_digest
-        stream.announced[heartbeat.last] = heartbeat.prefix_digest
+        link.announced = max(link.announced, heartbeat.last)
+        stream.announced[heartbeat.checked] = (heartbeat.checked_digest, data)
+        stream.announced[heartbeat.last] = (heartbeat.prefix_digest, data)
         while len(stream.announced) > ANNOUNCED_MAX:
             del stream.announced[next(iter(stream.announced))]
         held = stream.check_digests.get(heartbeat.checked)
@@ -208,9 +209,11 @@ class FusionCore:
             streams = [(self.ledger.stream(p.vehicle, p.epoch), p) for p in status.streams]
         except WireError as error:
             return self._malformed(node, error)
+        if node not in self._peers and len(self._peers) >= NODES_MAX:
+            return self._malformed(node, WireError(f"status of more than {NODES_MAX} nodes"))
         self._peers[node] = Peer(now_s, {(p.vehicle, p.epoch): p.last for p in status.streams})
         effects: list[Effect] = []
-        ask = any(key not in self.ledger.events for key in status.events)
+        ask = status.events != self.ledger.events_digest()
         for stream, position in streams:
             link = self._link(stream)
             link.elsewhere = max(link.elsewhere, position.last)
@@ -260,7 +263,7 @@ class FusionCore:
         stream = self.ledger.streams.get((vehicle, request.epoch))
         if stream is None or (request.fleet, request.vehicle) != (self.ledger.fleet, vehicle):
             return []
-        found: list[bytes] = [stream.witness] if stream.witness and stream.snapshot_covers(request.first) else []
+        found: list[bytes] = []
         size = 0
         first = request.first
         while first < stream.next and first <= request.last and len(found) < request.count and size < REPLY_BYTES_MAX:
@@ -268,7 +271,7 @@ class FusionCore:
             found.append(stream.log[at])
             size += len(stream.log[at])
             first = stream.firsts[at + 1] if at + 1 < len(stream.log) else stream.next
-        return found
+        return [stream.voucher, *found] if stream.voucher and stream.snapshot_covers(request.first) else found
 
     def _malformed(self, who: str, error: WireError) -> list[Effect]:
         self._count("malformed", who, str(error))
@@ -306,7 +309,7 @@ class FusionCore:
         if now_s >= self._status_due_s:
             self._status_due_s = now_s + self._settings.status_s
             effects.append(PutStatus(encode_status(self.status(), self._signer)))
-        if self.ledger.bytes > self._compact_at:
+        if self.ledger.bytes_held > self._compact_at:
             self.compact()
         return effects
 
@@ -319,19 +322,19 @@ class FusionCore:
             streams=tuple(
                 StreamPosition(s.vehicle, s.epoch, s.next - 1, s.prefix_digest, s.evidence_id) for s in streams
             ),
-            events=tuple(self.ledger.events),
+            events=self.ledger.events_digest(),
         )
 
     def compact(self) -> int:
         """Replace prefixes by snapshots where that is safe; returns the bytes saved. See `compaction`."""
-        before = self.ledger.bytes
+        before = self.ledger.bytes_held
         required = [name for name in self._settings.required_acks if name != self.node]
         for key, stream in self.ledger.streams.items():
             held = [self._peers[name].last.get(key, -1) if name in self._peers else -1 for name in required]
             self.ledger.replace(stream, compact(stream, min([stream.checked, *held]), self.node, self._signer))
-        self._compact_at = max(self._settings.compact_bytes, 2 * self.ledger.bytes)
-        log.info("ledger_compacted before=%d after=%d", before, self.ledger.bytes)
-        return before - self.ledger.bytes
+        self._compact_at = max(self._settings.compact_bytes, 2 * self.ledger.bytes_held)
+        log.info("ledger_compacted before=%d after=%d", before, self.ledger.bytes_held)
+        return before - self.ledger.bytes_held
 
     def _link(self, stream: Stream) -> Link:
         return self._links.setdefault(stream.key, Link(wait_s=self._settings.repair_after_s))
@@ -355,7 +358,7 @@ class FusionCore:
             epoch=stream.epoch,
             last=max(stream.next - 1, 0),
             prefix_digest=stream.prefix_digest,
-            fault=stream.quarantine[:200],
+            fault=self.ledger.verdict(stream)[:200],
         )
         return PutAck(stream.vehicle, encode_ack(ack, self._signer))
 
@@ -377,13 +380,17 @@ class FusionCore:
             link.gap_since_s = now_s
         if now_s < link.gap_since_s + link.wait_s or stream.next in stream.parked:
             return []  # not yet, or all it waits for is the epoch that it continues
-        asking = sum(each.asking_until_s is not None and now_s < each.asking_until_s for each in self._links.values())
-        if asking >= self._settings.queries_max:
+        if self._asking(stream.vehicle, now_s) >= self._settings.queries_max:
             return []
         last = min(stream.parked) - 1 if stream.parked else wanted
         link.asking_until_s, link.next_at_ask = now_s + QUERY_LOST_S, stream.next
         nodes = bool(self._peers) and (link.ask_nodes or link.elsewhere > link.announced)
         return [AskRange(stream.vehicle, stream.epoch, self._request(stream, stream.next, last), nodes)]
+
+    def _asking(self, vehicle: str, now_s: float) -> int:
+        """Queries about a vehicle that are under way."""
+        links = (link for (name, _), link in self._links.items() if name == vehicle)
+        return sum(link.asking_until_s is not None and now_s < link.asking_until_s for link in links)
 
     def states(self, now_s: float) -> tuple[VehicleState, ...]:
         """Every stream that is known, by vehicle and epoch."""
@@ -392,13 +399,14 @@ class FusionCore:
 
     def _state(self, key: tuple[str, Epoch], link: Link, now_s: float, placed: set[tuple[str, int]]) -> VehicleState:
         stream = self.ledger.streams[key]
+        verdict = self.ledger.verdict(stream)
         return VehicleState(
             name=stream.vehicle,
             life=stream.number,
             epoch=stream.epoch,
             cut=stream.next - 1,
             checked=stream.checked,
-            behind=max(self._wanted(stream, link) - stream.next + 1, 0),
+            behind=min(max(self._wanted(stream, link) - stream.next + 1, 0), SEQUENCE_MAX),
             parked=len(stream.parked),
             duplicates=stream.duplicates,
             gaps_repaired=link.repaired,
@@ -406,8 +414,8 @@ class FusionCore:
             placed=(stream.vehicle, id(stream.life)) in placed,
             stalled=not stream.over and now_s - link.heard_s > self._settings.stalled_s,
             ended=stream.ended,
-            healthy=stream.healthy and not stream.quarantine,
-            fault=stream.quarantine[:200],
+            healthy=stream.healthy and not verdict,
+            fault=verdict[:200],
         )
 
     def waited_for(self, now_s: float) -> bool:
@@ -433,4 +441,6 @@ class FusionCore:
         newest = max(streams, key=lambda s: s.epoch)
         link = self._link(newest)
         in_sight = link.elsewhere if vehicle in self.gone else self._wanted(newest, link)
+        if newest.next == 0:
+            return bool(self.ledger.verdict(newest))
         return newest.over or (newest.stop is not None and in_sight < newest.next)

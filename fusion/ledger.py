@@ -56,7 +56,7 @@ class Ledger:
         self.streams: dict[tuple[str, Epoch], Stream] = {}
         self.events: dict[tuple[int, str], bytes] = {}
         self.decisions = Decisions()
-        self.bytes = 0
+        self._bytes_of: dict[str, int] = {}
         self._settings = settings or FusionSettings()
         self._keys = keys
         self._changes: list[Change] = []
@@ -80,8 +80,18 @@ class Ledger:
                 raise WireError(f"message {int.from_bytes(key[-8:], 'big')} of {stream.vehicle!r} cannot be folded")
         for key, value in found.get(records.WITNESS, []):
             self.stream(*records.stream_of(key)).witness = value
+        for key, value in found.get(records.VOUCHER, []):
+            self.stream(*records.stream_of(key)).voucher = value
         self._restoring = False
         self._changes.clear()
+
+    @property
+    def bytes_held(self) -> int:
+        """Bytes of all messages that are folded."""
+        return sum(self._bytes_of.values())
+
+    def _count_bytes(self, vehicle: str) -> None:
+        self._bytes_of[vehicle] = sum(s.log_bytes for s in self.streams.values() if s.vehicle == vehicle)
 
     def take_changes(self) -> list[Change]:
         """What the store must keep of all that has happened since the last call."""
@@ -94,6 +104,7 @@ class Ledger:
         for stream in self.streams.values():
             for table, value in (
                 (records.WITNESS, stream.witness),
+                (records.VOUCHER, stream.voucher),
                 (records.EVIDENCE, stream.evidence),
                 (records.QUARANTINE, stream.quarantine.encode()),
             ):
@@ -132,7 +143,7 @@ class Ledger:
         self._check_origin(message, sender)
         stream = self.stream(message.vehicle, message.epoch)
         receipt = self._accept_message(stream, message, data)
-        if receipt is Receipt.FOLDED:
+        if receipt is Receipt.FOLDED or stream.over:
             self._fold_parked(stream)
         stream.duplicates += receipt is Receipt.DUPLICATE
         stream.refused += receipt is Receipt.REFUSED
@@ -151,17 +162,26 @@ class Ledger:
             return self._compare(stream, message, data, stream.bytes_at(message.first))
         if stream.parked:
             for parked in self._overlapping(stream, message):
+                if parked.prefix_digest is not None and message.last <= parked.message.last:
+                    return Receipt.DUPLICATE  # a snapshot that waits stands for it
                 return self._compare(stream, message, data, parked.data)
         if not stream.takes(message.last):
             return Receipt.REFUSED
         if self._contradicts_another_epoch(stream, message, data):
             return Receipt.REFUSED
         if message.first == stream.next and self._may_begin(stream, message):
-            if self.bytes + len(data) > self._settings.ledger_bytes_max and not self._restoring:
+            if self._full(stream.vehicle, len(data)):
                 return Receipt.DROPPED
             self._fold(stream, Parked(message, data))
             return Receipt.REFUSED if stream.fault else Receipt.FOLDED
         return self._park(stream, Parked(message, data))
+
+    def _full(self, vehicle: str, size: int) -> bool:
+        """Whether so many bytes more of a vehicle are too many."""
+        settings = self._settings
+        of_vehicle = self._bytes_of.get(vehicle, 0)
+        full = self.bytes_held + size > settings.ledger_bytes_max or of_vehicle + size > settings.vehicle_bytes_max
+        return full and not self._restoring
 
     def _compare(self, stream: Stream, message: DeltaMessage, data: bytes, held: bytes) -> Receipt:
         """A message about numbers that are held already: the same again, or proof against its vehicle."""
@@ -213,7 +233,9 @@ class Ledger:
         if before is None or before is stream:
             return False
         whole = before.next == continues.last + 1 and before.life is not None
-        return whole and before.fault is None and before.stop is None
+        rivals = self._continued_by.get(before.key, [])
+        alone = not any(rival is not stream and rival.next > 0 for rival in rivals)
+        return whole and alone and before.fault is None and before.stop is None
 
     def _park(self, stream: Stream, parked: Parked) -> Receipt:
         settings, message = self._settings, parked.message
@@ -251,12 +273,13 @@ class Ledger:
         if stream.life is not None:
             stream.fault = stream.life.fold(message, check=parked.prefix_digest is not None)
         stream.note(message, parked.data, parked.prefix_digest)
-        self.bytes += len(parked.data)
+        self._bytes_of[stream.vehicle] = self._bytes_of.get(stream.vehicle, 0) + len(parked.data)
         if stream.fault is None and (parked.prefix_digest is not None or is_check_point(message)):
             stream.note_check()
         if keep:
             self._changes.append(Put(records.message_key(*stream.key, message.first), parked.data))
-            self._keep_verdict(stream)
+            if stream.fault is not None:
+                self._keep_verdict(stream)
 
     def _life_of(self, stream: Stream, message: DeltaMessage) -> tuple[LifeTotal | None, str | None]:
         continues = None if message.hello is None else message.hello.continues
@@ -275,6 +298,7 @@ class Ledger:
             parked = self._unpark(stream, stream.next)
             if parked.prefix_digest is None:
                 self._fold(stream, parked)
+                stream.refused += stream.fault is not None
             elif not self._replace_prefix(stream, parked):
                 return
         behind = [first for first in stream.parked if first < stream.next or stream.over] if stream.parked else []
@@ -292,11 +316,17 @@ class Ledger:
             stream.duplicates += 1
             return Receipt.DUPLICATE, stream
         believed = not snapshot.maker or sender is None
-        believed = believed or stream.announced.get(message.last) == snapshot.prefix_digest
+        digest, heartbeat = stream.announced.get(message.last, (b"", b""))
+        believed = believed or digest == snapshot.prefix_digest
         later = any(s.next > 0 for s in self._continued_by.get(stream.key, []))
         if not believed or later or not stream.takes(message.last):
             stream.refused += 1
             return Receipt.REFUSED, stream
+        if self._full(stream.vehicle, len(data)):
+            return Receipt.DROPPED, stream
+        if snapshot.maker and heartbeat:
+            stream.voucher = heartbeat
+            self._changes.append(Put(records.stream_key(records.VOUCHER, *stream.key), heartbeat))
         if not self._may_begin(stream, message):
             if 0 in stream.parked:
                 return Receipt.DUPLICATE, stream
@@ -340,8 +370,8 @@ class Ledger:
     def _refold(self, chain: list[Stream], logs: dict[tuple[str, Epoch], list[bytes]]) -> None:
         """Make a life anew from the logs of its streams, each as far as it counts."""
         for each in chain:
-            self.bytes -= each.log_bytes
             each.forget_folded()
+        self._count_bytes(chain[0].vehicle)
         for each in chain:
             for data in logs[each.key]:
                 parked = _parked_of(data)
@@ -354,7 +384,7 @@ class Ledger:
         first, second = sorted((a, b), key=body_digest)
         identity = hashlib.blake2b(body_digest(first) + body_digest(second), digest_size=32).digest()
         stream = self.stream(stop.vehicle, stop.epoch)
-        sequence = max(stop.sequence, stream.after_snapshot)  # what has been compacted cannot be taken apart again
+        sequence = stop.sequence
         if stream.stop is not None and (stream.stop, stream.evidence_id) <= (sequence, identity):
             return
         stream.stop, stream.evidence_id = sequence, identity
@@ -366,11 +396,27 @@ class Ledger:
         if stream.next > sequence or chain[-1] is not stream:
             self._refold(chain, {s.key: list(s.log) for s in chain})
             self._changes.extend(self._delete(s, s.next) for s in chain)
-        self._keep_verdict(stream)
+        for each in chain:
+            self._keep_verdict(each)
 
     def _keep_verdict(self, stream: Stream) -> None:
+        key = records.stream_key(records.QUARANTINE, *stream.key)
         if stream.quarantine:
-            self._changes.append(Put(records.stream_key(records.QUARANTINE, *stream.key), stream.quarantine.encode()))
+            self._changes.append(Put(key, stream.quarantine.encode()))
+        else:
+            self._changes.append(Delete(key, key + b"\0"))
+
+    def verdict(self, stream: Stream) -> str:
+        """Why nothing more of a stream counts: its quarantine, or that of an epoch that it continues; "" for none."""
+        for _ in range(EPOCHS_MAX):
+            if stream.quarantine:
+                return stream.quarantine
+            hello = stream.hello or (stream.parked[0].message.hello if 0 in stream.parked else None)
+            before = self.streams.get((stream.vehicle, hello.continues.epoch)) if hello and hello.continues else None
+            if before is None:
+                return ""
+            stream = before
+        return "continues more epochs than are taken"
 
     def keep_witness(self, stream: Stream, checked: int, heartbeat: bytes) -> None:
         """Keep the heartbeat with which a vehicle announced a check point that this node has reached too."""
@@ -380,7 +426,7 @@ class Ledger:
 
     def replace(self, stream: Stream, changes: Sequence[Change]) -> None:
         """Take over what compacting a stream has changed."""
-        self.bytes = sum(each.log_bytes for each in self.streams.values())
+        self._count_bytes(stream.vehicle)
         self._changes.extend(changes)
 
     def accept_evidence(self, data: bytes) -> bool:
@@ -416,6 +462,13 @@ class Ledger:
         self._changes.append(Put(records.event_key(*key), data))
         return True
 
+    def events_digest(self) -> bytes:
+        """32 bytes that identify the decisions held, zeros for none."""
+        if not self.events:
+            return bytes(32)
+        digests = b"".join(body_digest(self.events[key]) for key in sorted(self.events))
+        return hashlib.blake2b(digests, digest_size=32).digest()
+
     def issue(
         self,
         operator: str,
@@ -449,7 +502,8 @@ class Ledger:
 
     def lives(self, *, live: bool = False) -> tuple[Life, ...]:
         """What the placed lives have contributed, in canonical order: as checked, or `live` up to the last message."""
-        return tuple(_contribution(stream, live) for stream in self.placed())
+        stuck = {id(s.life) for s in self.streams.values() if s.quarantine}
+        return tuple(_contribution(stream, live and id(stream.life) not in stuck) for stream in self.placed())
 
     def classes(self, lives: Sequence[Life]) -> tuple[tuple[LandmarkName, ...], ...]:
         """Which landmarks are the same, by signature and by what operators have decided."""
@@ -463,8 +517,7 @@ class Ledger:
             if stream.next > 0:
                 text = f"{vehicle} {epoch.counter} {epoch.nonce} {stream.next} "
                 digest.update(text.encode() + stream.prefix_digest)
-        for key in sorted(self.events):
-            digest.update(body_digest(self.events[key]))
+        digest.update(self.events_digest())
         return digest.digest()
 
     def map_digest(self) -> bytes:

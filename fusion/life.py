@@ -118,7 +118,10 @@ class LifeTotal:
     def _check(self) -> str | None:
         frames = dict(self.checked.frames)
         for number in sorted(self._changed):
-            frames[number] = self.frames[number].total.delta()
+            total = self.frames[number].total.delta()
+            if frames.get(number) is total:
+                continue
+            frames[number] = total
             try:
                 definite = is_positive_definite(frames[number])
             except NumericalError as error:

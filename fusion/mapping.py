@@ -1,12 +1,13 @@
 """From the ledger to a served map."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from fleet_seif.config import FusionSettings
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import Life, marginal_covariances, solve
+from fleet_seif.joint import Life, landmark_classes, marginal_covariances, solve
 from fleet_seif.messages import JointMap, LandmarkName, VehicleState
 from fusion.core import FusionCore
 
@@ -56,7 +57,27 @@ def make_map(taken: MapInput, version: int, settings: FusionSettings, *, final: 
             return _solved(taken, taken.live, taken.live_classes, version, settings, final=False, canonical=False)
         except NumericalError:
             canonical = True
-    return _solved(taken, taken.checked, taken.classes, version, settings, final=final, canonical=canonical)
+    try:
+        return _solved(taken, taken.checked, taken.classes, version, settings, final=final, canonical=canonical)
+    except NumericalError:
+        # positive definite, and yet too lopsided to be solved: nobody may take the map from the others
+        good = tuple(life for life in taken.checked if _can_be_solved(life))
+        names = {(life.vehicle, life.life) for life in good}
+        classes = tuple(tuple(name for name in group if name[:2] in names) for group in taken.classes)
+        taken = dataclasses.replace(
+            taken, counters={**taken.counters, "lives_left_out": len(taken.checked) - len(good)}
+        )
+        kept = tuple(group for group in classes if group)
+        return _solved(taken, good, kept, version, settings, final=final, canonical=canonical)
+
+
+def _can_be_solved(life: Life) -> bool:
+    """Whether what a life has contributed is a map on its own."""
+    try:
+        marginal_covariances(solve([life], landmark_classes([life])))
+    except NumericalError:
+        return False
+    return True
 
 
 def _solved(

@@ -3,6 +3,7 @@
     f                                 fleet and node, msgpack
     m  vehicle \0 counter nonce first   a folded message, or a snapshot of the prefix as the first: the bytes received
     w  vehicle \0 counter nonce         the heartbeat that announced a check point up to which may be compacted
+    v  vehicle \0 counter nonce         the heartbeat that announced the end of the snapshot
     x  vehicle \0 counter nonce         evidence that a vehicle contradicts itself
     q  vehicle \0 counter nonce         why a stream is quarantined, UTF-8: a copy of the verdict, for people
     e  number operator                the decision of an operator
@@ -20,6 +21,7 @@ KIND: Final = "ledger"
 IDENTITY: Final = b"f"
 MESSAGE: Final = b"m"
 WITNESS: Final = b"w"
+VOUCHER: Final = b"v"
 EVIDENCE: Final = b"x"
 QUARANTINE: Final = b"q"
 EVENT: Final = b"e"

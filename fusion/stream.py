@@ -20,7 +20,7 @@ class Parked:
     prefix_digest: bytes | None = None
 
 
-@dataclass
+@dataclass(eq=False)
 class Stream:
     """What is known of an epoch.
 
@@ -28,6 +28,7 @@ class Stream:
     life: the sum that it is folded into; an epoch that continues another shares it. fault: why it is quarantined.
     stop, evidence: from which number on it contradicts itself, and the proof. witness: the heartbeat with which the
     vehicle announced a check point that this node has reached too, and up to which it may forget single messages.
+    voucher: the same for the snapshot that is held. announced: digests by number, each with its heartbeat.
     """
 
     vehicle: str
@@ -51,7 +52,8 @@ class Stream:
     evidence: bytes = b""
     evidence_id: bytes = b""
     witness: bytes = b""
-    announced: dict[int, bytes] = field(default_factory=dict)
+    voucher: bytes = b""
+    announced: dict[int, tuple[bytes, bytes]] = field(default_factory=dict)
     duplicates: int = 0
     refused: int = 0
 

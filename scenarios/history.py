@@ -36,6 +36,8 @@ def uncertainty_of(moment: Moment, earlier: Moment) -> float:
 def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
     """The joint map at ascending times: the cut of all messages up to then. Times without a map are left out."""
     again = Ledger(ledger.fleet)
+    for event in ledger.events.values():
+        again.accept_event(event, own=True)
     waiting = sorted(
         (
             (t, i, data)

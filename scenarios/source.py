@@ -16,7 +16,10 @@ def vehicle_names(scenario: Scenario) -> tuple[str, ...]:
 
 def check_names(scenario: Scenario) -> None:
     """Raise ScenarioError where [faults] or [link] names a process that does not take part."""
-    known = {*vehicle_names(scenario), *scenario.fleet.node_names}
+    try:
+        known = {*vehicle_names(scenario), *scenario.fleet.node_names}
+    except DatasetError as error:
+        raise ScenarioError(str(error)) from None
     named = {
         "faults.events": {fault.who for fault in scenario.faults.events},
         "faults.hostile": {hostile.who for hostile in scenario.faults.hostile},

@@ -87,7 +87,8 @@ def ledger_info(file: Path, console: Console) -> Ledger:
         table.add_row(s.vehicle, *(str(count) for count in counts), state)
     size = file.stat().st_size
     console.print(
-        f"fleet {fleet}  node {node}  {size} bytes on disk, {ledger.bytes} of messages, {len(ledger.events)} events",
+        f"fleet {fleet}  node {node}  {size} bytes on disk, {ledger.bytes_held} of messages, "
+        f"{len(ledger.events)} events",
         soft_wrap=True,
     )
     console.print(table)

@@ -107,7 +107,7 @@ def picture(joint: JointMap) -> RenderableType:
 
 def vehicle_table(states: Sequence[VehicleState]) -> Table:
     """How every epoch of every vehicle is; a vehicle's epochs are numbered as they followed each other."""
-    table = Table(box=None, padding=(0, 1))
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     heads = ["vehicle", "life", "epoch", "folded", "behind", "parked", "twice", "repaired", "refused", "state"]
     for head in heads:
         table.add_column(head, no_wrap=head != "state", justify="left" if head in ("vehicle", "state") else "right")

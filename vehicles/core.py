@@ -30,7 +30,7 @@ from fleet_seif.records import Floats, Reading, Sightings
 from fleet_seif.seif import Seif, StepResult
 from fleet_seif.signing import KeyRing, Role, Signer
 from fleet_seif.store import Change, Delete, Put
-from fleet_seif.wire import decode_ack, decode_message, decode_range, encode_heartbeat, is_start_covariance
+from fleet_seif.wire import POSE_MAX, decode_ack, decode_range, encode_heartbeat, is_start_covariance
 from vehicles import records
 from vehicles.outbox import Outbox
 from vehicles.records import EpochRecord, Trimmed
@@ -69,8 +69,10 @@ class Counters:
 
 def _check_start(identity: Identity) -> None:
     pose, cov = identity.start_pose, identity.start_pose_cov
-    if pose.shape != (3,) or not np.all(np.isfinite(pose)):
-        raise ValueError(f"start_pose {pose.tolist()}: expected three finite numbers, x m, y m, theta rad")
+    if pose.shape != (3,) or not np.all(np.abs(pose) <= POSE_MAX):
+        raise ValueError(
+            f"start_pose {pose.tolist()}: expected three finite numbers, x m, y m, theta rad, none beyond {POSE_MAX:g}"
+        )
     if cov.shape != (3, 3) or not (np.array_equal(cov, np.zeros((3, 3))) or is_start_covariance(cov)):
         raise ValueError(
             f"start_pose_cov {cov.tolist()}: expected zeros (given) or a symmetric positive definite (3, 3) matrix"
@@ -223,9 +225,9 @@ class VehicleCore:
                 )
             self.steps, self.time_s = step, reading.time_s
             self._reading_bytes += len(kept[key])
-        newest = [name for name in kept if name[:1] == records.MESSAGE]
-        if newest:
-            self.healthy = decode_message(kept[max(newest)]).healthy
+        newest = self.outbox.newest
+        if newest is not None:
+            self.healthy = newest.healthy
 
     def _forget_filter(self) -> None:
         self.filter = Seif(self.filter.settings, self.filter.model)

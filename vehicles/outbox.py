@@ -25,6 +25,7 @@ from fleet_seif.wire import decode_message, encode_message, encode_snapshot
 from vehicles import records
 from vehicles.records import EpochRecord, Trimmed
 
+ANSWER_BYTES_MAX = 4 * 2**20
 COALESCED_MAX = DELTA_MAX // 4
 """Bytes of a message above which it is not made larger."""
 
@@ -96,6 +97,15 @@ class Outbox:
             self._unsent.append(_Unsent(message, data, -1))
             self._fixed += 1
             self.last, self.ended = message.last, message.end
+
+    @property
+    def newest(self) -> DeltaMessage | None:
+        """The last message of this epoch, acknowledged or not."""
+        if self._unsent:
+            return self._unsent[-1].message
+        if self._sent:
+            return self._sent[-1].message
+        return None if self._trimmed is None else decode_message(self._trimmed.newest)
 
     def digest_of_all(self) -> bytes:
         """Prefix digest at the last message, put or not."""
@@ -284,9 +294,11 @@ class Outbox:
         if request.first <= self._trimmed_last:
             snapshot = self.snapshot(published, signatures)
             found += [] if snapshot is None else [encode_snapshot(snapshot, self._signer)]
+        size = 0
         for sent in self._sent:
-            if len(found) >= request.count:
+            if len(found) >= request.count or size > ANSWER_BYTES_MAX:
                 break
+            size += len(sent.data)
             if sent.message.last >= request.first and sent.message.first <= request.last:
                 found.append(sent.data)
         return found
