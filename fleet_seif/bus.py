@@ -260,6 +260,8 @@ def open_bus(
             reason = f"cannot listen on {', '.join(listen)} (port taken, or address not of this machine?)"
         else:
             reason = f"cannot reach a fusion node at {', '.join(connect)}: start it first, or check the address"
+            if any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect):
+                reason += "; a certificate that is refused looks the same"
         raise RunError(f"{reason}: {error}") from None
     bus = ZenohBus(session)
     try:

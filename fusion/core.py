@@ -13,6 +13,7 @@
 import contextlib
 import logging
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from fleet_seif.config import FusionSettings
@@ -130,6 +131,13 @@ class FusionCore:
         self._peers: dict[str, Peer] = {}
         self._status_due_s = 0.0
         self._compact_at = settings.compact_bytes
+
+    def restore(self, stored: Iterable[tuple[bytes, bytes]], now_s: float) -> None:
+        """Go on from what a store has kept, as if all of it had just been heard. Raises WireError."""
+        self.ledger.restore(stored)
+        for stream in self.ledger.streams.values():
+            self._link(stream).heard_s = now_s
+        self.changed = bool(self.ledger.streams)
 
     def on_delta(self, vehicle: str, data: bytes, now_s: float) -> list[Effect]:
         """A message that a vehicle put."""

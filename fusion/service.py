@@ -48,7 +48,7 @@ class Statistics:
     solve_s: list[float] = field(default_factory=list)
 
 
-def restore(core: FusionCore, store: Store) -> None:
+def restore(core: FusionCore, store: Store, now_s: float) -> None:
     """Fold again what a store has kept, and note whose it is. Raises StoreError where it is not this node's."""
     mine = f"{core.ledger.fleet}/{core.node}".encode()
     stored = dict(store.load(records.IDENTITY, records.IDENTITY + b"\0")).get(records.IDENTITY, mine)
@@ -57,7 +57,7 @@ def restore(core: FusionCore, store: Store) -> None:
             f"the store is that of node {stored.decode()}, this is {mine.decode()}: give each node a store of its own"
         )
     try:
-        core.ledger.restore(store.load())
+        core.restore(store.load(), now_s)
     except WireError as error:
         raise StoreError(
             f"the store holds what this node never put there: {error}. Move it away and start afresh: vehicles and"

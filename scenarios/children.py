@@ -179,7 +179,7 @@ def run_fusion(
         if store is None:
             say({"event": "note", "text": "the ledger is kept in memory only: --store FILE keeps it for a restart"})
         else:
-            restore(core, store)
+            restore(core, store, clock())
             held = sum(len(stream.log) for stream in core.ledger.streams.values())
             if held:
                 say({"event": "note", "text": f"goes on with {held} messages that it has kept"})

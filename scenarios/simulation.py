@@ -253,7 +253,7 @@ class SimNode(Process):
     def _boot(self) -> None:
         scenario, simulation = self._simulation.scenario, self._simulation
         self.core = FusionCore(scenario.fleet.name, self.name, scenario.fusion, expected=len(simulation.vehicles))
-        self.core.ledger.restore(self.disk.load())
+        self.core.restore(self.disk.load(), self.clock_s)
         simulation.on_boot(self)
         self._effects, self._flushing = [], False
         self.later(FUSION_TICK_S, self._tick)

@@ -123,7 +123,7 @@ def ledger_compact(file: Path, console: Console) -> None:
     store = SqliteStore.open(file, records.KIND, records.SCHEMA)
     try:
         core = FusionCore(fleet, node, FusionSettings())
-        restore(core, store)
+        restore(core, store, 0.0)
         digest, before = core.ledger.ledger_digest(), file.stat().st_size
         saved = core.compact()
         store.commit(core.ledger.take_changes())

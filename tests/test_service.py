@@ -198,7 +198,7 @@ def test_what_is_acknowledged_is_in_the_store() -> None:
         service._work()
         assert acks_in(bus)[-1] == disk.messages - 1
     again = FusionCore("f", "node", settings)
-    restore(again, disk)
+    restore(again, disk, 0.0)
     assert again.ledger.ledger_digest() == core.ledger.ledger_digest()
     assert again.ledger.map_digest() == core.ledger.map_digest()
 
@@ -218,11 +218,11 @@ def test_a_store_that_fails_ends_the_service_and_nothing_is_acknowledged() -> No
 
 def test_a_store_of_another_node_or_fleet_is_refused() -> None:
     disk = MemoryStore()
-    restore(FusionCore("f", "node", SETTINGS), disk)
-    restore(FusionCore("f", "node", SETTINGS), disk)
+    restore(FusionCore("f", "node", SETTINGS), disk, 0.0)
+    restore(FusionCore("f", "node", SETTINGS), disk, 0.0)
     for fleet, node in (("f", "other"), ("g", "node")):
         with pytest.raises(StoreError, match="f/node"):
-            restore(FusionCore(fleet, node, SETTINGS), disk)
+            restore(FusionCore(fleet, node, SETTINGS), disk, 0.0)
 
 
 @pytest.mark.parametrize("damage", ["foreign", "bytes"])
@@ -238,4 +238,4 @@ def test_a_store_with_what_its_node_never_put_there_is_refused(damage: str) -> N
     bad = {"foreign": put(other)[0], "bytes": b"nonsense"}
     disk.commit([Put(keys[2], bad[damage])])
     with pytest.raises(StoreError, match="Move it away"):
-        restore(FusionCore("f", "node", SETTINGS), disk)
+        restore(FusionCore("f", "node", SETTINGS), disk, 0.0)
