@@ -1,5 +1,6 @@
 """Fixtures shared by tests: isolated Zenoh networks on loopback, each on a port the system chooses."""
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -14,6 +15,14 @@ class Network:
 
     bus: ZenohBus
     endpoint: str
+
+
+@pytest.fixture(autouse=True, scope="module")
+def log_level() -> Iterator[None]:
+    """What the tests of a module do to the level of the log ends with them: a chaos arena turns it down for good."""
+    level = logging.getLogger().level
+    yield
+    logging.getLogger().setLevel(level)
 
 
 @pytest.fixture

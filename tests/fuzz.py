@@ -277,7 +277,7 @@ class Receivers:
              len(s.log), dict(s.announced), s.hello is None, s.duplicates)
             for s in ledger.streams.values()
         ]  # fmt: skip
-        return streams, ledger.contents(), ledger.bytes, ledger._parked_bytes, sorted(ledger.events)
+        return streams, ledger.contents(), ledger.bytes_held, ledger._parked_bytes, sorted(ledger.events)
 
 
 def _vehicle() -> VehicleCore:

@@ -132,7 +132,7 @@ CONTINUING = Hello(
     step_information_max=2.0**-20, continues=Continues(epoch=Epoch(1, 7), last=41, prefix_digest=DIGEST_1),
 )  # fmt: skip
 UNPLACED = Hello(
-    software="é" * 200, life=VARIABLE_MAX, placed=False, start_pose=np.array([-0.0, 5e-324, -1.5e308]),
+    software="é" * 200, life=VARIABLE_MAX, placed=False, start_pose=np.array([-0.0, 5e-324, -1e9]),
     start_pose_cov=np.zeros((3, 3)), start_information=1e9, step_information_max=1e9,
 )  # fmt: skip
 
@@ -211,7 +211,7 @@ POSITIONS = (
     StreamPosition("v1", Epoch(0, 7), 130, DIGEST_1, b""),
     StreamPosition("v2", Epoch(0, 2**63), -1, bytes(32), DIGEST_2),
 )
-KNOWN = NodeStatus(fleet=FLEET, node="fusion", streams=POSITIONS, events=((1, "ops"), (SEQUENCE_MAX, "ops2")))
+KNOWN = NodeStatus(fleet=FLEET, node="fusion", streams=POSITIONS, events=DIGEST_2)
 RANGE = RangeRequest(fleet=FLEET, vehicle="v1", epoch=Epoch(0, 7), first=64, last=127, count=256)
 RANGE_EDGE = RangeRequest(
     fleet="-" * 32, vehicle="_" * 32, epoch=Epoch(0, 0), first=SEQUENCE_MAX, last=SEQUENCE_MAX, count=4096
@@ -266,7 +266,7 @@ EXAMPLES: dict[str, Example] = {
     "event-retract": (event(Action.RETRACT), OPERATOR),
     "event-restore": (event(Action.RESTORE), None),
     "status": (KNOWN, NODE),
-    "status-empty": (NodeStatus(fleet=FLEET, node="fusion", streams=(), events=()), None),
+    "status-empty": (NodeStatus(fleet=FLEET, node="fusion", streams=(), events=bytes(32)), None),
     "evidence": (Evidence(
         first=wire.encode_message(message(5, parts=(part(CONTINUED, STEP),))),
         second=wire.encode_message(message(4, 6), VEHICLE),

@@ -11,6 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from typer.testing import CliRunner, Result
+
+from scenarios.cli import app
+
 COMMAND = [sys.executable, "-m", "scenarios"]
 PATIENCE_S = 60.0
 LOOK_S = 0.02
@@ -27,6 +31,20 @@ def wait_until(condition: Callable[[], object], what: str, patience_s: float = P
     while not condition():
         assert time.monotonic() < end_s, f"never: {what}"
         time.sleep(LOOK_S)
+
+
+def invoke(*arguments: str) -> Result:
+    """The same in this process, which saves starting one."""
+    return CliRunner().invoke(app, list(arguments))
+
+
+def refused(code: int, *arguments: str) -> str:
+    """What a command says, run in this process, that is refused: a sentence, no traceback."""
+    done = invoke(*arguments)
+    assert done.exit_code == code, (done.output, done.stderr, done.exception)
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    assert "Traceback" not in done.stderr
+    return " ".join(done.stderr.split())
 
 
 class Child:

@@ -31,6 +31,7 @@ from fleet_seif.messages import (
     VehicleState,
 )
 from fleet_seif.records import Floats, Ints
+from fleet_seif.wire import POSE_MAX
 
 settled = settings(
     deadline=None,
@@ -121,7 +122,7 @@ def hellos() -> SearchStrategy[Hello]:
         software=st.text(max_size=50),
         life=st.integers(0, VARIABLE_MAX),
         placed=st.booleans(),
-        start_pose=table(3),
+        start_pose=vectors(3, POSE_MAX),
         start_pose_cov=covariances(),
         start_information=st.floats(1e-3, 1e9),
         step_information_max=st.floats(1e-3, 1e9),
@@ -217,7 +218,7 @@ def statuses() -> SearchStrategy[NodeStatus]:
         fleet=NAMES,
         node=NAMES,
         streams=st.lists(position, max_size=3).map(tuple),
-        events=st.lists(st.tuples(st.integers(1, 2**53), NAMES), max_size=3).map(tuple),
+        events=DIGESTS,
     )
 
 

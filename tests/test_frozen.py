@@ -15,15 +15,16 @@ import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from fleet_seif.bus import ZenohBus, open_bus
 from fleet_seif.client import MapAssembler
-from fleet_seif.config import FilterSettings, PublishSettings
+from fleet_seif.config import FilterSettings, FusionSettings, PublishSettings
 from fleet_seif.keys import Keys
-from fleet_seif.messages import Epoch, JointMap
+from fleet_seif.messages import Continues, Epoch, JointMap
 from fleet_seif.wire import decode_ack, decode_message, encode_message
 from scenarios.config import load_scenario
 from scenarios.recording import Log
@@ -41,6 +42,9 @@ FACTOR = 2.0
 FLOOR_S = 0.02
 FLOOD_HZ = 3000
 BATCH = 30
+EPOCHS = 200
+PARKED_MAX = FusionSettings().parked_max
+NOTHING: dict[str, Any] = {"parts": (), "landmarks": (), "innovation": 0.0, "innovation_dof": 0, "step": 1}
 KEYS = Keys("fleet")
 
 
@@ -65,14 +69,20 @@ def stream_of(log: Log) -> Iterator[bytes]:
 def flood(kind: str, endpoint: str) -> None:
     """Put thousands of messages a second under the key of v3."""
     stream = list(stream_of(log_of("v3")))
-    template = decode_message(stream[-1])
+    template, hello = decode_message(stream[-1]), decode_message(stream[0])
+    assert hello.hello is not None
     rng = random.Random(1)
     with open_bus(connect=[endpoint]) as bus:
         begin_s = time.monotonic()
         for number in itertools.count():
             if kind == "valid":  # in order, then all of it again
                 data = stream[number % len(stream)]
-            elif kind == "ahead":  # the first is missing, and so is every second
+            elif kind == "continued" and number > PARKED_MAX:  # epochs that all continue the one that waits
+                continues = Continues(epoch=template.epoch, last=10**6, prefix_digest=bytes(32))
+                epoch = Epoch(2 + number % EPOCHS, 1)
+                changed = dataclasses.replace(hello.hello, continues=continues)
+                data = encode_message(dataclasses.replace(hello, epoch=epoch, hello=changed, **NOTHING))
+            elif kind in ("ahead", "continued"):  # the first is missing, and so is every second
                 first = 2 * number + 1
                 data = encode_message(dataclasses.replace(template, first=first, last=first, step=first))
             else:
@@ -130,7 +140,7 @@ class Probe:
         time.sleep(PHASE_S)
         last = len(self.put_s)
         wait_until(lambda: self._acked[-1][0] >= last - 1 and self._shown[-1][0] >= last - 1, "all of it shown")
-        found = {}
+        found: dict[str, float] = {}
         for name, heard in (("ack", self._acked), ("map", self._shown)):
             times = [_first_at(heard, number) - self.put_s[number] for number in range(first, last)]
             found |= {f"{name} p{q}": float(np.percentile(times, q)) for q in (50, 95)}
@@ -197,7 +207,7 @@ def test_a_stopped_vehicle_does_not_slow_the_others(fleet: tuple[Fleet, Child]) 
         check("stopped vehicle", probe, vehicle.pause)
 
 
-@pytest.mark.parametrize("kind", ["garbage", "valid", "ahead"])
+@pytest.mark.parametrize("kind", ["garbage", "valid", "ahead", "continued"])
 def test_a_flood_from_one_vehicle_does_not_slow_the_others(fleet: tuple[Fleet, Child], kind: str) -> None:
     _, node = fleet
     with probe_of(node.endpoint) as probe, contextlib.ExitStack() as stack:

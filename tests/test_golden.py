@@ -24,7 +24,7 @@ LIMITS = {
     name: getattr(module, name)
     for module in (messages, node_wire, map_wire, wire, information, delta_wire, envelope)
     for name in dir(module)
-    if name.endswith("_MAX") or name in ("PIECE_BYTES",)
+    if name.endswith("_MAX") or name in ("PIECE_BYTES", "VARIANCE_MIN")
 }
 
 

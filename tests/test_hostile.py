@@ -22,7 +22,7 @@ import pytest
 
 from fleet_seif.config import FilterSettings, FusionSettings, PublishSettings
 from fleet_seif.envelope import KIND_MAP, body_digest, seal
-from fleet_seif.errors import WireError
+from fleet_seif.errors import NumericalError, WireError
 from fleet_seif.information import H_QUANTUM, QUANTA_MAX, FrameDelta, delta_digest
 from fleet_seif.joint import solve
 from fleet_seif.map_wire import decode_map, encode_map
@@ -633,9 +633,9 @@ def test_two_nodes_come_to_the_same_verdict_whatever_the_order(name: str) -> Non
 def check_alone(ledger: Ledger, inputs: Iterable[tuple[str, bytes]], *, refused: bool = True) -> None:
     """Inputs that must be refused, all of them, with nothing changed."""
     for sender, data in inputs:
-        before = (ledger.contents(), sorted(ledger.streams), ledger.bytes, ledger._parked_bytes)
+        before = (ledger.contents(), sorted(ledger.streams), ledger.bytes_held, ledger._parked_bytes)
         assert (give(ledger, sender, data) is None) is refused
-        assert (ledger.contents(), sorted(ledger.streams), ledger.bytes, ledger._parked_bytes) == before
+        assert (ledger.contents(), sorted(ledger.streams), ledger.bytes_held, ledger._parked_bytes) == before
 
 
 def test_a_flood_of_epochs_ends_at_a_limit_and_stops_nobody() -> None:
@@ -722,7 +722,7 @@ def check_everything_unsigned_is_refused(draws: int) -> None:
 
 def status_of(node: str, last: int, epoch: Epoch = EPOCH) -> NodeStatus:
     positions = tuple(StreamPosition(v, epoch, last, bytes(32), b"") for v in VEHICLES)
-    return NodeStatus(fleet=FLEET, node=node, streams=positions, events=())
+    return NodeStatus(fleet=FLEET, node=node, streams=positions, events=bytes(32))
 
 
 def check_the_honest_core(core: FusionCore) -> None:
@@ -884,11 +884,7 @@ def test_a_garbage_snapshot_that_had_to_wait_quarantines_nobody_and_can_be_resto
     assert restored(ledger).map_digest() == ledger.map_digest()
 
 
-# Laws that a single authorised vehicle can break today. Strict: whoever mends one removes its mark.
-
-
-def known(reason: str) -> pytest.MarkDecorator:
-    return pytest.mark.xfail(strict=True, reason=reason)
+# What a single authorised vehicle may try.
 
 
 def node_with_the_honest() -> FusionCore:
@@ -912,7 +908,6 @@ def announced(core: FusionCore, messages: Sequence[DeltaMessage]) -> Ledger:
     return core.ledger
 
 
-@known("wire.is_start_covariance: eigvalsh raises LinAlgError on what overflows when scaled")
 def test_a_covariance_that_overflows_is_refused() -> None:
     cov = np.array([[1e-300, 1e308, 1e308], [1e308, 1e-300, -1e308], [1e308, -1e308, 1e-300]])
     with np.errstate(all="ignore"):
@@ -922,21 +917,18 @@ def test_a_covariance_that_overflows_is_refused() -> None:
         )
 
 
-@known("map_wire.decode_map: sorted() of keys of two types raises TypeError")
 def test_counters_with_keys_of_two_types_are_refused() -> None:
     fields: list[Any] = [["f", "n", 0, True, False, bytes(32), bytes(32)], [b"", b"", -1], [], [], [[], b"", b""], []]
     with pytest.raises(WireError):
         decode_map(seal(KIND_MAP, [*fields, {"a": 1, b"b": 1}]))
 
 
-@known("fusion/core._state: behind is one above what map_wire reads, and no subscriber takes a map any more")
 def test_a_heartbeat_cannot_make_maps_unreadable() -> None:
     core = node_with_the_honest()
     core.on_heartbeat("eve", encode_heartbeat(heartbeat("eve", 2**53)), 0.0)
     decode_map(encode_map(make_map(map_input(core, 0.0), 0, LIVELY, final=False)))
 
 
-@known("fusion/core._repair: queries_max is shared by all, and one vehicle's epochs take every query for ever")
 def test_many_epochs_with_gaps_of_one_vehicle_do_not_keep_another_from_being_repaired() -> None:
     core = FusionCore(FLEET, "fusion", LIVELY)
     for n in range(100):
@@ -947,7 +939,6 @@ def test_many_epochs_with_gaps_of_one_vehicle_do_not_keep_another_from_being_rep
     assert any(effect.vehicle == "ann" for effect in asked)
 
 
-@known("fusion/compaction.compact: the sum passes 2^64, and msgpack's OverflowError ends the node")
 def test_statistics_that_add_up_to_more_than_there_is_do_not_stop_compaction() -> None:
     core = FusionCore(FLEET, "fusion", FusionSettings())
     messages = [lied(k, parts=(part(OPENED, pose(1)),) if k == 0 else (), innovation_dof=2**53) for k in range(2049)]
@@ -956,7 +947,6 @@ def test_statistics_that_add_up_to_more_than_there_is_do_not_stop_compaction() -
     core.compact()
 
 
-@known("a correction is exempt from `absurd`, its coalesced snapshot is not: the node cannot start again")
 def test_what_has_been_compacted_can_be_restored() -> None:
     core = FusionCore(FLEET, "fusion", FusionSettings())
     whole = (part(OPENED, pose(START)), part(ENDED, FrameDelta.nothing()), part(OPENED, pose(START), 1))
@@ -967,7 +957,6 @@ def test_what_has_been_compacted_can_be_restored() -> None:
     assert restored(ledger).map_digest() == digest
 
 
-@known("a snapshot hides the hello in it: two epochs are folded into one life, and a restart gives another map")
 def test_a_life_is_continued_once_though_a_snapshot_says_so() -> None:
     one, other = Epoch(2, 0), Epoch(2, 1)
     ledger = fresh()
@@ -978,7 +967,6 @@ def test_a_life_is_continued_once_though_a_snapshot_says_so() -> None:
     assert len(begun) <= 1
 
 
-@known("an epoch that is folded no more keeps its `q` record: the store is not what the ledger holds")
 def test_the_store_forgets_the_verdict_on_an_epoch_that_is_folded_no_more() -> None:
     ledger, later = fresh(), Epoch(2, 1)
     for m in (continuing(6, later), lied(1, epoch=later, aliases=((0, 9, True),)), lied(5, step=99)):
@@ -986,7 +974,9 @@ def test_the_store_forgets_the_verdict_on_an_epoch_that_is_folded_no_more() -> N
     check_store(ledger, ledger.take_changes(), restore=True)
 
 
-@known("a vehicle's own snapshot may say something else than its messages: equal ledger digests, different maps")
+@pytest.mark.xfail(
+    strict=True, reason="a limit (README): a vehicle's own snapshot is its own word, and may not be what it sent before"
+)
 def test_nodes_that_hold_one_prefix_digest_hold_one_map() -> None:
     other = Snapshot(
         message=lied(0, 6, parts=(part(OPENED, pose(2)),), hello=hello("eve")), prefix_digest=prefix_digest("eve", 6)
@@ -1000,7 +990,6 @@ def test_nodes_that_hold_one_prefix_digest_hold_one_map() -> None:
     assert (a.map_digest() == b.map_digest()) == (a.ledger_digest() == b.ledger_digest())
 
 
-@known("ledger._contribution(live) takes what a quarantined life had added beyond its last check")
 def test_live_maps_hold_no_more_of_a_quarantined_vehicle_than_canonical_ones() -> None:
     ledger = fresh()
     give(ledger, "eve", encode_message(lied(NEXT, aliases=((1, 1, True),))))
@@ -1015,7 +1004,6 @@ UNSOLVABLE: Final = {
 }
 
 
-@known("one life that cannot be solved takes the map from all: its own failure must leave it out")
 @pytest.mark.parametrize("changes", UNSOLVABLE.values(), ids=UNSOLVABLE)
 def test_a_life_that_cannot_be_solved_does_not_take_the_map_from_others(changes: dict[str, Any]) -> None:
     ledger = fresh()
@@ -1025,39 +1013,47 @@ def test_a_life_that_cannot_be_solved_does_not_take_the_map_from_others(changes:
     assert np.all(np.isfinite(solve(lives, ledger.classes(lives)).mean))
 
 
-@known("the same, by two frames of a quantum each with the largest b")
 def test_frames_of_next_to_nothing_do_not_take_the_map_from_others() -> None:
-    ledger, much = fresh(), 2**59
+    """Two frames of a quantum each with the largest b: positive definite, and nobody can solve them."""
+    core, much = node_with_the_honest(), 2**59
+    alone = make_map(map_input(core, 0.0), 0, LIVELY, final=True)
     least = {(0, 0): [1, 0, 0, 1, 0, 1], (1, 1): [1, 0, 1]}
     parts = (
         part(OPENED, delta_of({(0, 0): [1, 0, 0, 1, 0, 1]}, {0: [much] * 3})), part(ENDED, FrameDelta.nothing()),
         part(OPENED, delta_of(least, {0: [much] * 3, 1: [much, -much]}), 1),
     )  # fmt: skip
     m = lied(0, epoch=Epoch(2, 1), parts=parts, landmarks=((0, 70),), hello=hello("eve", life=1))
-    assert give(ledger, "eve", encode_message(m)) is Receipt.FOLDED
-    lives = ledger.lives()
-    assert np.all(np.isfinite(solve(lives, ledger.classes(lives)).mean))
+    assert give(core.ledger, "eve", encode_message(m)) is Receipt.FOLDED
+    with pytest.raises(NumericalError):
+        solve(core.ledger.lives(), core.ledger.classes(core.ledger.lives()))
+    joint = make_map(map_input(core, 0.0), 0, LIVELY, final=True)
+    assert joint.counters["lives_left_out"] == 1
+    assert (joint.names, joint.poses) == (alone.names, alone.poses)
+    assert np.array_equal(joint.landmark_mean, alone.landmark_mean)
+    decode_map(encode_map(joint))
 
 
-@known("ledger_bytes_max is shared by all: who fills it first keeps the others out")
 def test_one_vehicle_cannot_fill_the_ledger_for_others() -> None:
-    ledger = Ledger(FLEET, FusionSettings(ledger_bytes_max=20_000))
-    for k in range(400):
+    ledger = Ledger(FLEET, FusionSettings(vehicle_bytes_max=20_000))
+    receipts = [
         give(ledger, "eve", encode_message(lied(k, parts=(part(OPENED, pose(1)),) if k == 0 else ())))
+        for k in range(400)
+    ]
+    assert Receipt.DROPPED in receipts
+    assert 10_000 < ledger.bytes_held <= 20_000
     assert ledger.accept(honest_bytes("ann")[0], "ann")[0] is Receipt.FOLDED
 
 
-@known("_accept_snapshot does not look at ledger_bytes_max")
-def test_snapshots_count_against_the_limit_of_the_ledger() -> None:
-    ledger = Ledger(FLEET, FusionSettings(ledger_bytes_max=20_000))
+@pytest.mark.parametrize("limit", ["ledger_bytes_max", "vehicle_bytes_max"])
+def test_snapshots_count_against_the_limits_of_the_ledger(limit: str) -> None:
+    ledger = Ledger(FLEET, FusionSettings.model_validate({limit: 20_000}))
     fat = tuple((n, -1) for n in range(2000))
     for n in range(10):
         m = lied(0, epoch=Epoch(1, n), parts=(part(OPENED, pose(1)),), landmarks=fat)
         give(ledger, "eve", encode_snapshot(Snapshot(message=m, prefix_digest=bytes(32))))
-    assert ledger.bytes <= 20_000
+    assert ledger.bytes_held <= 20_000
 
 
-@known("STREAMS_MAX is shared by all: four vehicles with 250 epochs each keep every new one out")
 def test_a_few_vehicles_cannot_take_all_streams() -> None:
     ledger = Ledger(FLEET)
     for liar in range(4):
@@ -1066,14 +1062,19 @@ def test_a_few_vehicles_cannot_take_all_streams() -> None:
     assert give(ledger, "ann", honest_bytes("ann")[0]) is Receipt.FOLDED
 
 
-@known("ledger.restore takes evidence before messages: a compacted prefix, once acknowledged, is gone after a restart")
-def test_a_restart_keeps_the_compacted_prefix_of_a_vehicle_that_contradicts_itself() -> None:
+def test_evidence_below_a_snapshot_drops_it_before_and_after_a_restart() -> None:
     core = FusionCore(FLEET, "fusion", FusionSettings())
     ledger = announced(core, told("eve")[: CHECKED + 1])
     core.compact()
     first, second = (encode_message(lied(3, step=k)) for k in (1, 2))
     ledger.accept_evidence(encode_evidence(Evidence(first=first, second=second)))
-    stream = ledger.streams["eve", EPOCH]
-    assert stream.quarantine
-    assert stream.next == CHECKED + 1
-    assert restored(ledger).map_digest() == ledger.map_digest()
+    again = restored(ledger)
+    assert again.map_digest() == ledger.map_digest()
+    for each in (ledger, again):
+        stream = each.streams["eve", EPOCH]
+        assert stream.quarantine
+        assert stream.next == 0
+        for data in honest_bytes("eve"):
+            give(each, "eve", data)
+        assert (stream.next, stream.checked) == (3, 0)
+    assert again.map_digest() == ledger.map_digest()

@@ -38,8 +38,8 @@ def expected_digest(settings: list[str]) -> str:
 
 
 def test_a_killed_vehicle_and_a_killed_fusion_node_change_nothing(tmp_path: Path) -> None:
-    settings = ["fleet.vehicles=2", "world.steps=60", "world.landmarks=40", f"run.rate_hz={RATE_HZ}"]
-    digest, starts = digest_of_run(tmp_path, settings, [kill("v1", 0.5), kill("fusion", 0.9)])
+    settings = ["fleet.vehicles=1", "world.steps=40", "world.landmarks=30", f"run.rate_hz={RATE_HZ}"]
+    digest, starts = digest_of_run(tmp_path, settings, [kill("v1", 0.4), kill("fusion", 0.6)])
     assert digest == expected_digest(settings)
     assert starts == Counter(v1=1)
 
@@ -80,3 +80,11 @@ def test_the_check_after_a_kill_notices_what_is_gone_or_another() -> None:
             kills.check_kept(ledger, [ack(**changes)])
     with pytest.raises(AssertionError):
         kills.check_kept(Ledger("fleet"), [ack()])
+
+
+@pytest.mark.slow
+def test_a_vehicle_that_is_killed_after_its_last_step_finds_a_node_when_it_starts_again(tmp_path: Path) -> None:
+    settings = ["fleet.vehicles=1", "world.steps=40", "world.landmarks=30", f"run.rate_hz={RATE_HZ}", "link.delay_s=1"]
+    # it takes its last step at 1 s, the node has all of it at 2 s, and it hears so at 3 s
+    digest, _ = digest_of_run(tmp_path, settings, [kill("v1", 2.5, for_s=2.0)])
+    assert digest == expected_digest(settings)

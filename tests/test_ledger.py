@@ -187,14 +187,14 @@ def test_a_ledger_that_is_full_drops_and_keeps_what_it_has() -> None:
     ledger = fed([("ann", k) for k in range(3)], FusionSettings(ledger_bytes_max=held + SIZES[3] - 1))
     receipt, stream = ledger.accept(streams()["ann"][3])
     assert receipt is Receipt.DROPPED
-    assert (stream.next, stream.quarantine, ledger.bytes) == (3, "", held)
+    assert (stream.next, stream.quarantine, ledger.bytes_held) == (3, "", held)
 
 
 @given(ARRIVALS)
 @settled
 def test_the_bytes_of_a_ledger_are_those_of_its_logs_and_of_what_is_parked(arrivals: list[tuple[str, int]]) -> None:
     ledger = fed(arrivals)
-    assert ledger.bytes == sum(len(data) for s in ledger.streams.values() for data in s.log)
+    assert ledger.bytes_held == sum(len(data) for s in ledger.streams.values() for data in s.log)
     assert ledger._parked_bytes == sum(len(p.data) for s in ledger.streams.values() for p in s.parked.values())
     assert ledger._parked_bytes == sum(s.parked_bytes for s in ledger.streams.values())
 
@@ -528,9 +528,9 @@ def test_a_snapshot_of_another_node_counts_only_with_a_digest_that_the_vehicle_a
     made = long_snapshot(64, "hub")
     receipt, stream = ledger.accept(made, sender="ann")
     assert (receipt, stream.next) == (Receipt.REFUSED, 0)
-    stream.announced[64] = bytes(32)
+    stream.announced[64] = (bytes(32), b"")
     assert ledger.accept(made, sender="ann")[0] is Receipt.REFUSED
-    stream.announced[64] = decode_snapshot(made).prefix_digest
+    stream.announced[64] = (decode_snapshot(made).prefix_digest, b"")
     assert ledger.accept(made, sender="ann")[0] is Receipt.FOLDED
     assert (stream.next, stream.checked) == (65, 64)
 
@@ -609,7 +609,7 @@ def streams_of_epoch(epoch: Epoch) -> list[bytes]:
     return put(core)
 
 
-# Reported.
+# Snapshots that wait, and streams that are over.
 
 
 def resumed() -> tuple[list[bytes], list[bytes]]:
@@ -642,7 +642,6 @@ def test_a_snapshot_that_waits_and_then_breaks_a_rule_is_refused_like_one_that_d
     assert [s.quarantine for s in waiting.streams.values()] == [s.quarantine for s in late.streams.values()]
 
 
-@pytest.mark.xfail(strict=True, reason="reported: early messages of a stream that is over are held on to")
 def test_nothing_stays_parked_of_a_stream_that_is_over() -> None:
     bad = encode_message(dataclasses.replace(message("ann", 1), landmarks=((9_000, 1),)))
     ledger = fed([("ann", 0), ("ann", 5)])
@@ -652,7 +651,7 @@ def test_nothing_stays_parked_of_a_stream_that_is_over() -> None:
 
 
 @pytest.mark.xfail(
-    strict=True, reason="reported: a snapshot skips the checks inside it, so the verdict depends on the order"
+    strict=True, reason="a limit (README): a vehicle's own snapshot is its own word, and is checked at its end only"
 )
 def test_a_snapshot_over_a_check_that_fails_gives_the_verdict_of_the_messages() -> None:
     """Information that is taken away before a check point and given back after it."""

@@ -147,27 +147,39 @@ def test_check_points_are_multiples_of_64_and_where_frames_or_the_stream_end(
         assert min(n for n in held if n >= point) in check_points(grouped)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="reported: a correction that is coalesced with its frame's end loses its exemption"
-)
 def test_a_large_correction_is_taken_alone_and_coalesced() -> None:
+    """Coalesced with the end of its frame, and with another correction, it is a correction still."""
     messages = [dataclasses.replace(m) for m in HONEST["ann", MAIN][:5]]
     huge = dataclasses.replace(messages[4].parts[0], delta=strategies.pose_block(2**50))
     messages[4] = dataclasses.replace(messages[4], parts=(huge, *messages[4].parts[1:]))
-    assert effect(messages) == effect(cut(messages, {2}))
+    again = dataclasses.replace(
+        messages[4], first=5, last=5, step=5, parts=(dataclasses.replace(huge, delta=strategies.pose_block(2**49)),)
+    )
+    assert effect([*messages, again]) == effect(cut([*messages, again], {2}))
 
 
-def test_a_frame_that_ended_and_was_corrected_in_one_message_has_ended_there() -> None:
+def test_a_frame_that_ended_and_was_corrected_is_said_to_have_ended_and_then_to_be_corrected() -> None:
     first, second, third = (decode_message(data) for data in streams()["ann"][:3])
     parts = [
         FramePart(frame=0, status=status, delta=FrameDelta.nothing(), end_pose=np.full(3, float(status)))
         for status in (FrameStatus.ENDED, FrameStatus.CORRECTED)
     ]
     later = [dataclasses.replace(m, parts=(part,)) for m, part in zip((second, third), parts, strict=True)]
-    (part,) = coalesced(later).parts
-    assert part.status is FrameStatus.ENDED
-    assert part.end_pose is parts[1].end_pose
-    assert [p.status for p in coalesced([first, *later]).parts] == [FrameStatus.OPENED, FrameStatus.ENDED]
+    ended, corrected = coalesced(later).parts
+    assert (ended.status, corrected.status) == (FrameStatus.ENDED, FrameStatus.CORRECTED)
+    assert (ended.end_pose is parts[0].end_pose, corrected.end_pose is parts[1].end_pose) == (True, True)
+    assert [p.status for p in coalesced([first, *later]).parts] == [
+        FrameStatus.OPENED, FrameStatus.ENDED, FrameStatus.CORRECTED
+    ]  # fmt: skip
+
+
+def test_corrections_come_after_everything_else_that_is_coalesced() -> None:
+    main = HONEST["ann", MAIN]
+    said = [(part.frame, part.status) for part in coalesced(main[1:6]).parts]
+    assert said == [
+        (0, FrameStatus.ENDED), (1, FrameStatus.OPENED), (1, FrameStatus.ENDED), (2, FrameStatus.OPENED),
+        (0, FrameStatus.CORRECTED),
+    ]  # fmt: skip
 
 
 def test_only_the_next_message_of_the_same_epoch_is_taken() -> None:

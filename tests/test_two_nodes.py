@@ -1,7 +1,6 @@
 """Fusion nodes that share a fleet, by hand as the README says: each complete, and any of them enough."""
 
 import asyncio
-import json
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -34,6 +33,24 @@ def digest() -> bytes:
 
 def digest_at(fleet: Fleet, name: str) -> bytes:
     return read_ledger(fleet.store(name), "fleet").map_digest()
+
+
+class Hub:
+    """fleet-seif hub."""
+
+    def __init__(self, connect: list[str] | None = None, listen: str = "tcp/127.0.0.1:0") -> None:
+        links = [part for endpoint in connect or [] for part in ("--connect", endpoint)]
+        self.process = subprocess.Popen(
+            [*COMMAND, "hub", "--listen", listen, *links], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert self.process.stdout is not None
+        self.endpoint = self.process.stdout.readline().removeprefix("listening on ").strip()
+
+    def close(self) -> int:
+        self.process.terminate()
+        _, errors = self.process.communicate(timeout=PATIENCE_S)
+        assert "Traceback" not in errors
+        return self.process.returncode
 
 
 class Subscriber:
@@ -77,6 +94,7 @@ def test_when_a_node_dies_for_good_the_others_go_on_with_the_one_that_is_left(fl
     assert digest_at(fleet, left) == digest
 
 
+@pytest.mark.slow
 def test_two_nodes_hold_the_same_and_a_third_catches_up_from_a_compacted_one_alone(fleet: Fleet, digest: bytes) -> None:
     first = fleet.node(*EXPECTED)
     second = fleet.node(*EXPECTED, name="fusion2", connect=[first.endpoint])
@@ -98,6 +116,7 @@ def test_two_nodes_hold_the_same_and_a_third_catches_up_from_a_compacted_one_alo
     assert again.terminate() == 128 + 15
 
 
+@pytest.mark.slow
 def test_a_node_that_comes_late_catches_up_from_the_vehicles_snapshots(fleet: Fleet, digest: bytes) -> None:
     first = fleet.node()
     hub = Hub([first.endpoint])
@@ -115,6 +134,7 @@ def test_a_node_that_comes_late_catches_up_from_the_vehicles_snapshots(fleet: Fl
     assert all(stream.snapshot_covers(63) for stream in ledger.streams.values())
 
 
+@pytest.mark.slow
 def test_a_node_that_starts_again_listens_where_it_did(fleet: Fleet, digest: bytes) -> None:
     node = fleet.node(*EXPECTED)
     endpoint = node.endpoint
@@ -129,6 +149,7 @@ def test_a_node_that_starts_again_listens_where_it_did(fleet: Fleet, digest: byt
     assert digest_at(fleet, "fusion") == digest
 
 
+@pytest.mark.slow
 def test_a_node_whose_port_is_taken_meanwhile_takes_another(fleet: Fleet) -> None:
     node = fleet.node()
     endpoint = node.endpoint
@@ -141,24 +162,7 @@ def test_a_node_whose_port_is_taken_meanwhile_takes_another(fleet: Fleet) -> Non
         hub.close()
 
 
-class Hub:
-    """fleet-seif hub."""
-
-    def __init__(self, connect: list[str] | None = None, listen: str = "tcp/127.0.0.1:0") -> None:
-        links = [part for endpoint in connect or [] for part in ("--connect", endpoint)]
-        self.process = subprocess.Popen(
-            [*COMMAND, "hub", "--listen", listen, *links], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        assert self.process.stdout is not None
-        self.endpoint = self.process.stdout.readline().removeprefix("listening on ").strip()
-
-    def close(self) -> int:
-        self.process.terminate()
-        _, errors = self.process.communicate(timeout=PATIENCE_S)
-        assert "Traceback" not in errors
-        return self.process.returncode
-
-
+@pytest.mark.slow
 def test_a_hub_alone_routes_between_nodes_vehicles_and_subscribers(fleet: Fleet, digest: bytes) -> None:
     hub = Hub()
     try:
@@ -175,18 +179,3 @@ def test_a_hub_alone_routes_between_nodes_vehicles_and_subscribers(fleet: Fleet,
     finally:
         assert hub.close() == 128 + 15
     assert digest_at(fleet, "fusion") == digest_at(fleet, "fusion2") == digest
-
-
-def test_status_says_once_how_everybody_is(fleet: Fleet) -> None:
-    node = fleet.node()
-    for vehicle in [fleet.vehicle(name, [node.endpoint]) for name in VEHICLES]:
-        vehicle.finish()
-    told = command("status", node.endpoint)
-    assert told.returncode == 0, told.stderr
-    assert told.stdout.count("ended") == 2
-    as_json = command("status", node.endpoint, "--json")
-    joint = json.loads(as_json.stdout)
-    assert [(state["name"], state["ended"], state["behind"]) for state in joint["vehicles"]] == [
-        ("v1", True, 0), ("v2", True, 0),
-    ]  # fmt: skip
-    assert joint["map_digest"][:16] in told.stdout

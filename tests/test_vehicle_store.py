@@ -226,7 +226,6 @@ def unhealthy(core: VehicleCore) -> None:
     core.healthy = False
 
 
-@pytest.mark.xfail(strict=True, reason="reported: health is forgotten once the message that says so is acknowledged")
 def test_a_vehicle_that_was_not_healthy_is_not_healthy_after_a_restart() -> None:
     for forgotten in (False, True):
         store, core, ledger = MemoryStore(), new_core(), Ledger(FLEET)
