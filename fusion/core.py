@@ -374,7 +374,7 @@ class FusionCore:
         """The last number that there is and that may still count, as far as is known."""
         if stream.over:
             return stream.next - 1
-        last = max(link.announced, link.elsewhere, max(stream.parked, default=-1))
+        last = max(link.announced, link.elsewhere, stream.parked_firsts[-1] if stream.parked else -1)
         return last if stream.stop is None else min(last, stream.stop - 1)
 
     def _repair(self, stream: Stream, link: Link, now_s: float) -> list[Effect]:
@@ -390,7 +390,7 @@ class FusionCore:
             return []  # not yet, or all it waits for is the epoch that it continues
         if self._asking(stream.vehicle, now_s) >= self._settings.queries_max:
             return []
-        last = min(stream.parked) - 1 if stream.parked else wanted
+        last = stream.parked_firsts[0] - 1 if stream.parked else wanted
         link.asking_until_s, link.next_at_ask = now_s + QUERY_LOST_S, stream.next
         nodes = bool(self._peers) and (link.ask_nodes or link.elsewhere > link.announced)
         return [AskRange(stream.vehicle, stream.epoch, self._request(stream, stream.next, last), nodes)]
@@ -420,7 +420,8 @@ class FusionCore:
             gaps_repaired=link.repaired,
             refused=stream.refused,
             placed=(stream.vehicle, id(stream.life)) in placed,
-            stalled=not stream.over and now_s - link.heard_s > self._settings.stalled_s,
+            stalled=not (stream.over or self.ledger.is_continued(stream))
+            and now_s - link.heard_s > self._settings.stalled_s,
             ended=stream.ended,
             healthy=stream.healthy and not verdict,
             fault=verdict[:200],

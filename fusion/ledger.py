@@ -13,7 +13,8 @@
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
 from enum import Enum, auto
 
 import numpy as np
@@ -78,6 +79,8 @@ class Ledger:
             receipt, stream = self.accept(value)
             if receipt is Receipt.REFUSED and not stream.quarantine:
                 raise WireError(f"message {int.from_bytes(key[-8:], 'big')} of {stream.vehicle!r} cannot be folded")
+        for _, value in (*found.get(records.WITNESS, []), *found.get(records.VOUCHER, [])):
+            decode_heartbeat(value)
         for key, value in found.get(records.WITNESS, []):
             self.stream(*records.stream_of(key)).witness = value
         for key, value in found.get(records.VOUCHER, []):
@@ -193,13 +196,9 @@ class Ledger:
                 self._convict(held, data, stop)
         return Receipt.REFUSED
 
-    def _overlapping(self, stream: Stream, message: DeltaMessage) -> Iterator[Parked]:
+    def _overlapping(self, stream: Stream, message: DeltaMessage) -> list[Parked]:
         exact = stream.parked.get(message.first)
-        if exact is not None:
-            yield exact
-        for parked in stream.parked.values():
-            if parked.message.first <= message.last and message.first <= parked.message.last:
-                yield parked
+        return ([] if exact is None else [exact]) + stream.overlapping(message.first, message.last)
 
     def _contradicts_another_epoch(self, stream: Stream, message: DeltaMessage, data: bytes) -> bool:
         """Whether this message and one that is held about another epoch cannot both be true."""
@@ -211,7 +210,9 @@ class Ledger:
             before = self.streams.get((stream.vehicle, continues.epoch))
             rivals += [_hello_of(s) for s in self._continued_by.get((stream.vehicle, continues.epoch), [])]
             if before is not None:
-                rivals += [parked.data for parked in before.parked.values()]
+                at = bisect_right(before.parked_firsts, continues.last)
+                beyond = [before.parked[first] for first in before.parked_firsts[max(at - 1, 0) : at + 1]]
+                rivals += [parked.data for parked in beyond if parked.message.last > continues.last]
                 if before.next > continues.last + 1:
                     rivals.append(before.bytes_at(continues.last + 1))
         found = False
@@ -405,6 +406,10 @@ class Ledger:
             self._changes.append(Put(key, stream.quarantine.encode()))
         else:
             self._changes.append(Delete(key, key + b"\0"))
+
+    def is_continued(self, stream: Stream) -> bool:
+        """Whether an epoch that continues this one has begun."""
+        return any(later.next > 0 for later in self._continued_by.get(stream.key, []))
 
     def verdict(self, stream: Stream) -> str:
         """Why nothing more of a stream counts: its quarantine, or that of an epoch that it continues; "" for none."""

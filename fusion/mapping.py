@@ -11,6 +11,7 @@ from fleet_seif.joint import Life, landmark_classes, marginal_covariances, solve
 from fleet_seif.messages import JointMap, LandmarkName, VehicleState
 from fusion.core import FusionCore
 
+LEFT_OUT = "lives_left_out"
 Classes = tuple[tuple[LandmarkName, ...], ...]
 
 
@@ -64,9 +65,7 @@ def make_map(taken: MapInput, version: int, settings: FusionSettings, *, final: 
         good = tuple(life for life in taken.checked if _can_be_solved(life))
         names = {(life.vehicle, life.life) for life in good}
         classes = tuple(tuple(name for name in group if name[:2] in names) for group in taken.classes)
-        taken = dataclasses.replace(
-            taken, counters={**taken.counters, "lives_left_out": len(taken.checked) - len(good)}
-        )
+        taken = dataclasses.replace(taken, counters={**taken.counters, LEFT_OUT: len(taken.checked) - len(good)})
         kept = tuple(group for group in classes if group)
         return _solved(taken, good, kept, version, settings, final=final, canonical=canonical)
 
@@ -84,6 +83,11 @@ def _solved(
     taken: MapInput, lives: tuple[Life, ...], classes: Classes, version: int, settings: FusionSettings,
     *, final: bool, canonical: bool,
 ) -> JointMap:  # fmt: skip
+    if not lives:  # nothing yet, but who has been heard and what has been counted
+        return dataclasses.replace(
+            empty_map(taken.fleet, taken.node, version), canonical=canonical, final=final, map_digest=taken.map_digest,
+            ledger_digest=taken.ledger_digest, vehicles=taken.vehicles, counters=taken.counters,
+        )  # fmt: skip
     solution = solve(lives, classes)
     poses = solution.poses
     newest = {vehicle: i for i, (vehicle, _, k) in enumerate(poses) if k < 0}  # of several lives, the last

@@ -28,10 +28,12 @@ from fleet_seif.store import Put, Store, StoreError
 from fusion import records
 from fusion.core import AskEvents, AskRange, Effect, FusionCore, PutAck, PutStatus
 from fusion.inbox import Inbox
-from fusion.mapping import empty_map, make_map, map_input
+from fusion.mapping import LEFT_OUT, empty_map, make_map, map_input
 
 log = logging.getLogger(__name__)
 BURST_MAX = 256
+BURST_S = 0.01  # nobody waits longer than this, and a stride, for effects of what came before
+STRIDE = 16
 TICK_S = 0.02
 PROGRESS_S = 0.2
 LINGER_S = 30.0
@@ -72,6 +74,7 @@ class FusionService:
     Args:
         bus: what vehicles are reached by. maps: what subscribers are reached by, where that is another.
         store: where the ledger is kept, already restored into the core; None: in memory only. signer: signs maps.
+        held: whether it must stay though it has everything, for a vehicle that was killed and starts again.
         first_version: of its maps; one above those of an earlier node of this fleet lets subscribers go on.
     """
 
@@ -85,8 +88,10 @@ class FusionService:
         first_version: int = 0,
         store: Store | None = None,
         signer: Signer | None = None,
+        held: Callable[[], bool] = lambda: False,
     ) -> None:
         self._bus = bus
+        self._held = held
         self._maps = maps or bus
         self._core = core
         self._settings = settings
@@ -171,8 +176,8 @@ class FusionService:
         return self._inbox.dropped
 
     def _needed(self) -> bool:
-        """Whether a vehicle is still there, or another node that lacks what this one holds."""
-        return bool(self._alive) or self._core.waited_for(self._clock())
+        """Whether a vehicle is still there (or may come back), or another node that lacks what this one holds."""
+        return bool(self._alive) or self._held() or self._core.waited_for(self._clock())
 
     def stop(self) -> None:
         """Make `run` return."""
@@ -181,10 +186,16 @@ class FusionService:
     def _work(self) -> None:
         """Handle a part of what is in the inbox, and what is due. What is kept is committed before anybody is told."""
         effects: list[Effect] = []
-        events = self._inbox.take(BURST_MAX, TICK_S)
+        events, handled = self._inbox.take(STRIDE, TICK_S), 0
+        end_s = time.perf_counter() + BURST_S
         with self._lock:
-            for event in events:
-                effects += event()
+            while events:
+                for event in events:
+                    effects += event()
+                handled += len(events)
+                if handled >= BURST_MAX or time.perf_counter() >= end_s:
+                    break
+                events = self._inbox.take(STRIDE, 0.0)
             effects += self._core.tick(self._clock())
             changes = self._core.ledger.take_changes()
             if self._changed_at_s is None and self._core.changed:
@@ -223,7 +234,10 @@ class FusionService:
             try:
                 with self._lock:
                     stalled = [state.stalled for state in self._core.states(self._clock())]
-                if self._core.changed or stalled != [state.stalled for state in self.newest.vehicles]:
+                old = self.newest
+                counted = {name: n for name, n in old.counters.items() if name != LEFT_OUT}
+                news = stalled != [state.stalled for state in old.vehicles] or self._core.counters != counted
+                if self._core.changed or news or not self._served:
                     self._serve(final=False)
             except NumericalError as error:
                 log.error("map_not_solved reason=%s", error)

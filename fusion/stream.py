@@ -1,6 +1,6 @@
 """One epoch of one vehicle, as a fusion node holds it."""
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right, insort
 from dataclasses import dataclass, field
 
 from fleet_seif.envelope import KIND_SNAPSHOT, body_digest, kind_of
@@ -40,6 +40,7 @@ class Stream:
     checked: int = -1
     check_digests: dict[int, bytes] = field(default_factory=dict)
     parked: dict[int, Parked] = field(default_factory=dict)
+    parked_firsts: list[int] = field(default_factory=list)
     parked_bytes: int = 0
     log: list[bytes] = field(default_factory=list)
     log_bytes: int = 0
@@ -107,10 +108,19 @@ class Stream:
 
     def park(self, parked: Parked) -> None:
         self.parked[parked.message.first] = parked
+        insort(self.parked_firsts, parked.message.first)
         self.parked_bytes += len(parked.data)
+
+    def overlapping(self, first: int, last: int) -> list[Parked]:
+        """What is parked about some of these numbers; only a snapshot, parked as 0, may overlap others that are."""
+        low, high = bisect_left(self.parked_firsts, first), bisect_right(self.parked_firsts, last)
+        near = {0, *self.parked_firsts[max(low - 1, 0) : high]}
+        found = [self.parked[each] for each in sorted(near) if each in self.parked]
+        return [each for each in found if each.message.first <= last and first <= each.message.last]
 
     def unpark(self, first: int) -> Parked:
         parked = self.parked.pop(first)
+        del self.parked_firsts[bisect_left(self.parked_firsts, first)]
         self.parked_bytes -= len(parked.data)
         return parked
 

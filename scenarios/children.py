@@ -35,6 +35,7 @@ from vehicles import records as outbox_records
 from vehicles.drive import drive
 
 PROGRESS_S = 0.2
+RELEASE = b"release"
 SWITCH_S = 1e-4  # a step must not wait 5 ms for the threads that serve the network
 
 Say = Callable[[dict[str, Any]], None]
@@ -49,10 +50,12 @@ class Supervision:
     """What the launcher holds of a process: it ends when the launcher does, and it is told when the run begins.
 
     begin_s: when that was, on this process's monotonic clock; None before. A process by itself begins at once.
+    released: whether nobody needs it any more, as far as the launcher knows.
     """
 
     def __init__(self, *, alone: bool = False) -> None:
         self.begin_s: float | None = time.monotonic() if alone else None
+        self.released = alone
         self._go = threading.Event()
         if alone:
             self._go.set()
@@ -60,12 +63,15 @@ class Supervision:
             threading.Thread(target=self._listen, name="supervised", daemon=True).start()
 
     def _listen(self) -> None:
-        line = b""
+        said = b""
         while some := os.read(sys.stdin.fileno(), 64):  # not sys.stdin.read: it would hold a lock at the end
-            line += some
-            if b"\n" in line and self.begin_s is None:
-                self.begin_s = time.monotonic() - float(line.split()[0])
-                self._go.set()
+            *lines, said = (said + some).split(b"\n")
+            for line in lines:
+                if line == RELEASE:
+                    self.released = True
+                elif self.begin_s is None:
+                    self.begin_s = time.monotonic() - float(line)
+                    self._go.set()
         os.kill(os.getpid(), signal.SIGTERM)
 
     def wait_for_go(self) -> None:
@@ -130,18 +136,23 @@ class Place:
 
     def signer(self, fleet: str, role: Role, name: str) -> Signer | None:
         """Its private key. Raises RunError where that is somebody else's."""
-        if self.signing_key is None:
-            return None
-        signer = load_signer(self.signing_key)
-        if (signer.fleet, signer.role, signer.name) != (fleet, role, name):
-            raise RunError(
-                f"private key {self.signing_key} is that of {signer.role} {signer.name!r} of fleet {signer.fleet!r}, "
-                f"this is {role} {name!r} of fleet {fleet!r}"
-            )
-        return signer
+        return signer_of(self.signing_key, fleet, role, name)
 
     def keys(self) -> KeyRing | None:
         return None if self.key_ring is None else load_key_ring(self.key_ring)
+
+
+def signer_of(path: Path | None, fleet: str, role: Role, name: str) -> Signer | None:
+    """The private key in a file. Raises RunError where it is somebody else's."""
+    if path is None:
+        return None
+    signer = load_signer(path)
+    if (signer.fleet, signer.role, signer.name) != (fleet, role, name):
+        raise RunError(
+            f"private key {path} is that of {signer.role} {signer.name!r} of fleet {signer.fleet!r}, "
+            f"this is {role} {name!r} of fleet {fleet!r}"
+        )
+    return signer
 
 
 @contextlib.contextmanager
@@ -187,7 +198,7 @@ def run_fusion(
             version = time.time_ns() // 1_000_000  # so that the maps of a node started again count as newer
             service = FusionService(
                 bus, core, settings, clock, maps=session, first_version=version, store=store,
-                signer=place.signer(fleet, Role.NODE, name),
+                signer=place.signer(fleet, Role.NODE, name), held=lambda: not supervision.released,
             )  # fmt: skip
             say({"event": "listening", "endpoint": session.endpoints()[0]})
             service.run(_teller(say, settings, expected, clock))

@@ -276,16 +276,16 @@ def info(file: FileArgument) -> None:
 
 @ledger.command()
 @_clear_errors()
-def verify(file: FileArgument) -> None:
-    """Check a store: the file, every message in it, and the verdicts."""
-    tools.ledger_verify(file, console)
+def verify(file: FileArgument, key_ring: KeyRingOption = None) -> None:
+    """Check a store: the file, every message in it (with --key-ring its signature), and the verdicts."""
+    tools.ledger_verify(file, key_ring, console)
 
 
 @ledger.command()
 @_clear_errors()
-def compact(file: FileArgument) -> None:
+def compact(file: FileArgument, signing_key: SigningKeyOption = None) -> None:
     """Replace single messages by snapshots, and give back the space. The node must not be running."""
-    tools.ledger_compact(file, console)
+    tools.ledger_compact(file, signing_key, console)
 
 
 @app.command()

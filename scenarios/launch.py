@@ -99,6 +99,15 @@ class Children:
                 pipe.write(f"{run_s}\n")
                 pipe.flush()
 
+    def release(self, names: Iterable[str]) -> None:
+        """Tell processes that nobody needs them any more."""
+        for name in names:
+            pipe = self._processes[name].stdin
+            assert pipe is not None
+            with contextlib.suppress(BrokenPipeError):
+                pipe.write("release\n")
+                pipe.flush()
+
     def kill(self, name: str) -> bool:
         """Kill one that is to be started again; False where it has ended already."""
         with self._lock:
@@ -146,6 +155,7 @@ class _Run:
         self._say = say
         self._endpoints: dict[str, str] = {}
         self._ready: set[str] = set()
+        self._done: set[str] = set()
         self._begin_s: float | None = None
         self._over = threading.Event()
 
@@ -178,12 +188,18 @@ class _Run:
                 self._begin()
             case "progress":
                 progress(child, event["done"], event["total"])
+            case "done" if child in self._vehicles:
+                self._done.add(child)
+                if self._done == set(self._vehicles):
+                    self.children.release(self._endpoints)
 
     def _listening(self, node: str, endpoint: str) -> None:
         first = node not in self._endpoints
         self._endpoints[node] = endpoint
         if self._begin_s is not None:
             self.children.go([node], time.monotonic() - self._begin_s)
+        if self._done == set(self._vehicles):
+            self.children.release([node])
         if not first:
             return
         self._say(f"watch it: fleet-seif watch {endpoint} --fleet {self._scenario.fleet.name}")

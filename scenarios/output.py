@@ -11,7 +11,7 @@ from fleet_seif.errors import RunError, WireError
 from fleet_seif.joint import JointSolution
 from fleet_seif.records import Floats, Ints
 from fleet_seif.sqlite_store import SqliteStore
-from fleet_seif.store import StoreError
+from fleet_seif.store import Put, StoreError
 from fusion import records
 from fusion.core import FusionCore
 from fusion.ledger import Ledger
@@ -138,7 +138,7 @@ def write_ledger(path: Path, ledger: Ledger) -> None:
     """A store as a fusion node would have left it."""
     store = SqliteStore.open(path, records.KIND, records.SCHEMA)
     try:
-        store.commit(ledger.contents())
+        store.commit([Put(records.IDENTITY, f"{ledger.fleet}/fusion".encode()), *ledger.contents()])
     finally:
         store.close()
 

@@ -9,14 +9,18 @@ from rich.console import Console
 from rich.table import Table
 
 from fleet_seif.config import FusionSettings
-from fleet_seif.errors import RunError
+from fleet_seif.envelope import KIND_SNAPSHOT, authenticate, is_signed, kind_of
+from fleet_seif.errors import RunError, WireError
+from fleet_seif.signing import Role, load_key_ring
 from fleet_seif.sqlite_store import SqliteStore
+from fleet_seif.wire import decode_snapshot
 from fusion import records
 from fusion.core import FusionCore
 from fusion.ledger import Ledger
 from fusion.service import restore
 from scenarios import output, watch
 from scenarios.access import Kind, Member
+from scenarios.children import signer_of
 from scenarios.keys import make_keys
 
 
@@ -98,9 +102,21 @@ def ledger_info(file: Path, console: Console) -> Ledger:
     return ledger
 
 
-def ledger_verify(file: Path, console: Console) -> None:
-    """Check a store: the file itself, every message in it, and that the verdicts kept are those that come out."""
+def ledger_verify(file: Path, key_ring: Path | None, console: Console) -> None:
+    """Check a store: the file itself, every message in it, and that the verdicts kept are those that come out.
+
+    With the key ring of a fleet that signs, every signature too.
+    """
     ledger = ledger_info(file, console)
+    keys = None if key_ring is None else load_key_ring(key_ring)
+    for stream in ledger.streams.values():
+        for data in stream.log:
+            maker = decode_snapshot(data).maker if kind_of(data) == KIND_SNAPSHOT else ""
+            role, name = (Role.NODE, maker) if maker else (Role.VEHICLE, stream.vehicle)
+            try:
+                authenticate(data, keys, role, name)
+            except WireError as error:
+                raise RunError(f"{file}: a message of {stream.vehicle!r}: {error}") from None
     store = SqliteStore.open(file, records.KIND, records.SCHEMA, read_only=True)
     try:
         store.verify()
@@ -117,12 +133,19 @@ def ledger_verify(file: Path, console: Console) -> None:
     console.print("sound: the file is whole, and everything in it folds to these digests")
 
 
-def ledger_compact(file: Path, console: Console) -> None:
-    """Replace single messages by snapshots where the vehicle has announced the digest, and give back the space."""
+def ledger_compact(file: Path, signing_key: Path | None, console: Console) -> None:
+    """Replace single messages by snapshots where the vehicle has announced the digest, and give back the space.
+
+    Raises RunError where the messages are signed and the node's key is not given: nobody would take its snapshots.
+    """
     fleet, node = _whose(file)
+    signer = signer_of(signing_key, fleet, Role.NODE, node)
+    held = [data for stream in output.read_ledger(file, fleet).streams.values() for data in stream.log]
+    if signer is None and any(is_signed(data) for data in held):
+        raise RunError(f"{file} holds signed messages: give --signing-key, so that other nodes take the snapshots")
     store = SqliteStore.open(file, records.KIND, records.SCHEMA)
     try:
-        core = FusionCore(fleet, node, FusionSettings())
+        core = FusionCore(fleet, node, FusionSettings(), signer=signer)
         restore(core, store, 0.0)
         digest, before = core.ledger.ledger_digest(), file.stat().st_size
         saved = core.compact()

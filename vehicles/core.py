@@ -154,6 +154,24 @@ class VehicleCore:
         kept = dict(stored)
         if not kept:
             return False
+        try:
+            self._resume(kept, fresh)
+        except (
+            WireError,
+            ValueError,
+            KeyError,
+            TypeError,
+            IndexError,
+            ArithmeticError,
+            msgpack.UnpackException,
+        ) as error:
+            raise RunError(
+                f"the store is damaged, or not that of a vehicle ({type(error).__name__}: {error}): move it away and start"
+                " fresh, as another life"
+            ) from None
+        return True
+
+    def _resume(self, kept: dict[bytes, bytes], fresh: bool) -> None:
         same = self._check_store(kept[records.IDENTITY], fresh)
         counter = 1 + int.from_bytes(kept[records.COUNTER], "big")
         epoch = Epoch(max(counter, self.identity.epoch.counter), self.identity.epoch.nonce)
@@ -167,7 +185,7 @@ class VehicleCore:
                     self.outbox.close(self.filter.published(), self.filter.signatures)
             self._forget_filter()
             self._open(self.outbox.record.life + 1)
-            return True
+            return
         self._replay(kept)
         last = self.outbox
         if last.last < 0:  # it had not got as far as its hello
@@ -179,7 +197,6 @@ class VehicleCore:
             continues = Continues(epoch=last.record.epoch, last=last.last, prefix_digest=last.digest_of_all())
             self._open(last.record.life)
             self._send(time_s=self.time_s, parts=(), hello=self._hello(continues))
-        return True
 
     def _check_store(self, about: bytes, fresh: bool) -> bool:
         """Whether the store was written with this filter. Raises RunError where nothing can be done with it."""
