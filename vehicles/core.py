@@ -166,8 +166,8 @@ class VehicleCore:
             msgpack.UnpackException,
         ) as error:
             raise RunError(
-                f"the store is damaged, or not that of a vehicle ({type(error).__name__}: {error}): move it away and start"
-                " fresh, as another life"
+                f"the store is damaged, or not that of a vehicle ({type(error).__name__}: {error}): move it away and"
+                " start fresh, as another life"
             ) from None
         return True
 
