@@ -165,7 +165,7 @@ class Fleet(RuleBasedStateMachine):
         for data in source.log:
             if kind_of(data) == KIND_SNAPSHOT:
                 held = decode_snapshot(data)
-                target.stream(*key).announced[held.message.last] = (held.prefix_digest, b"")
+                target.stream(*key).announced[held.message.last] = (held.prefix_digest, source.voucher)
             target.accept(data, key[0])
 
     @rule(node=NODE, key=st.sampled_from([("ann", MAIN), ("bob", MAIN)]))

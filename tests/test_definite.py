@@ -105,13 +105,13 @@ def test_a_positive_definite_matrix_is_positive_definite(H: Floats) -> None:
 
 
 @given(sparse_matrices())
-@settings(settled, max_examples=400)
+@settings(settled, max_examples=150)
 def test_the_verdict_is_that_of_the_eigenvalues(H: Floats) -> None:
     check(delta_of(H))
 
 
 @given(st.integers(1, 5), st.integers(1, 4), st.sampled_from([-1e-3, -1e-6, 0.0, 1e-6, 1e-3]), st.data())
-@settings(settled, max_examples=200)
+@settings(settled, max_examples=100)
 def test_the_verdict_on_a_nearly_singular_matrix_is_that_of_the_eigenvalues(
     landmarks: int, lacking: int, shift: float, data: st.DataObject
 ) -> None:
@@ -121,7 +121,7 @@ def test_the_verdict_on_a_nearly_singular_matrix_is_that_of_the_eigenvalues(
 
 
 @given(st.one_of(deltas(), deltas(variable_max=3), deltas(variable_max=3, bound=2**40)))
-@settings(settled, max_examples=300)
+@settings(settled, max_examples=120)
 def test_any_delta_gets_the_verdict_of_the_eigenvalues(delta: FrameDelta) -> None:
     check(delta)
 

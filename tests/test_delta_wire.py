@@ -110,7 +110,7 @@ def damaged(value: Columns, bytes_tried: list[int]) -> Iterator[Columns]:
 
 
 @given(deltas())
-@settings(settled, max_examples=300)
+@settings(settled, max_examples=150)
 def test_a_delta_comes_back_as_it_was_and_its_bytes_are_those_of_the_columns(delta: FrameDelta) -> None:
     value = pack_delta(delta)
     assert value == slow_pack(delta)
@@ -142,7 +142,7 @@ def test_bytes_of_a_filters_delta_changed_put_in_or_left_out_are_refused_or_read
 
 
 @given(st.tuples(*[st.binary(max_size=12)] * 4))
-@settings(settled, max_examples=500)
+@settings(settled, max_examples=200)
 def test_any_bytes_are_refused_or_read_as_the_rules_say(value: Columns) -> None:
     check(value)
 
@@ -151,7 +151,7 @@ STEPS = st.one_of(st.integers(0, 3), st.integers(-2, 2**31), st.sampled_from([ST
 
 
 @given(st.lists(STEPS, max_size=4), st.lists(STEPS, max_size=6), st.data())
-@settings(settled, max_examples=500)
+@settings(settled, max_examples=200)
 def test_any_integers_are_refused_or_read_as_the_rules_say(
     variables: list[int], places: list[int], data: st.DataObject
 ) -> None:

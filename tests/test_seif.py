@@ -65,7 +65,7 @@ def state_of(seif: Seif) -> list[bytes]:
 @pytest.mark.parametrize("model", [RANGE_BEARING, COMPASS_XY])
 def test_without_sparsification_it_is_the_dense_information_filter(model: int) -> None:
     """H and b relative to the square root of the reference's diagonal, the mean in units of its sigma."""
-    log = drive(square(12, 4.0, 1), steps=2000, seed=2, model=model)
+    log = drive(square(12, 4.0, 1), steps=1000, seed=2, model=model)
     seif, dense = Seif(DENSE, model), reference.DenseEif(model, DENSE.start_information)
     seif.start(log.start)
     dense.see(log.start)

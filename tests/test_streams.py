@@ -77,7 +77,7 @@ def effect(messages: list[DeltaMessage]) -> object:
 
 
 @given(strategies.streams(), CUTS)
-@settings(settled, max_examples=100)
+@settled
 def test_coalesced_messages_have_the_effect_of_the_messages_themselves(
     messages: list[DeltaMessage], cuts: set[int]
 ) -> None:
@@ -241,14 +241,14 @@ def claims(draw: st.DrawFn) -> DeltaMessage:
 
 
 @given(claims(), claims())
-@settings(settled, max_examples=400)
+@settings(settled, max_examples=200)
 def test_who_contradicts_whom_does_not_depend_on_the_order(a: DeltaMessage, b: DeltaMessage) -> None:
     assert contradiction(a, b) == contradiction(b, a)
     assert contradiction(a, dataclasses.replace(b, vehicle="bob")) is None
 
 
 @given(claims(), claims())
-@settings(settled, max_examples=400)
+@settings(settled, max_examples=200)
 def test_a_contradiction_stops_an_epoch_of_one_of_the_two_at_a_number_that_one_of_them_speaks_of(
     a: DeltaMessage, b: DeltaMessage
 ) -> None:
