@@ -76,6 +76,11 @@ def _largest_diagonal(variables: Ints, rows: Ints, cols: Ints, H: Ints) -> int:
     return largest
 
 
+def quanta(information: float) -> int:
+    """Whole quanta of H in an amount of information: limits are compared, and added up, as integers."""
+    return int(information / H_QUANTUM)
+
+
 def largest_growth(delta: FrameDelta) -> int:
     """The largest entry on the diagonal of a delta's H, in quanta, at least 0."""
     return _largest_diagonal(delta.variables, delta.rows, delta.cols, delta.H)

@@ -15,7 +15,7 @@ import scipy.sparse
 from fleet_seif import seif_step as kernels
 from fleet_seif.config import FilterSettings
 from fleet_seif.errors import NumericalError, ReadingRefused
-from fleet_seif.information import H_QUANTUM, QUANTA_MAX, FrameDelta
+from fleet_seif.information import QUANTA_MAX, FrameDelta, quanta
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Ints, Reading, Sightings
 
@@ -102,10 +102,10 @@ class Seif:
         numbers, new = self._numbers(signature, first_new)
         self._reserve(len(new), len(numbers))
         settings = self.settings
-        most = settings.step_information_max + (0.0 if moves else settings.start_information)
+        most = quanta(settings.step_information_max) + (0 if moves else quanta(settings.start_information))
         code, statistics, *delta = kernels.seif_step(
             self._s, self.model, moves, u, cov, numbers, z, Z,
-            settings.active_max, settings.relax_others, settings.gate, settings.gate_patience, int(most / H_QUANTUM),
+            settings.active_max, settings.relax_others, settings.gate, settings.gate_patience, most,
         )  # fmt: skip
         if code in _FAULTS:
             raise ReadingRefused(f"reading refused: {_FAULTS[code]}; u={u.tolist()} z={seen.z.tolist()}")

@@ -191,8 +191,12 @@ class FusionCore:
         link = self._link(stream)
         link.heard_s = now_s
         link.announced = max(link.announced, heartbeat.last)
-        stream.announced[heartbeat.checked] = (heartbeat.checked_digest, data)
-        stream.announced[heartbeat.last] = (heartbeat.prefix_digest, data)
+        for number, digest in (
+            (heartbeat.last, heartbeat.prefix_digest),
+            (heartbeat.checked, heartbeat.checked_digest),
+        ):
+            stream.announced.pop(number, None)  # what was said last is forgotten last
+            stream.announced[number] = (digest, data)
         while len(stream.announced) > ANNOUNCED_MAX:
             del stream.announced[next(iter(stream.announced))]
         held = stream.check_digests.get(heartbeat.checked)
@@ -214,7 +218,6 @@ class FusionCore:
             status = decode_status(data)
             if (status.fleet, status.node) != (self.ledger.fleet, node):
                 raise WireError(f"status of {status.node!r} of {status.fleet!r} under the key of {node!r}")
-            streams = [(self.ledger.stream(p.vehicle, p.epoch), p) for p in status.streams]
         except WireError as error:
             return self._malformed(node, error)
         if node not in self._peers and len(self._peers) >= NODES_MAX:
@@ -222,7 +225,11 @@ class FusionCore:
         self._peers[node] = Peer(now_s, {(p.vehicle, p.epoch): p.last for p in status.streams})
         effects: list[Effect] = []
         ask = status.events != self.ledger.events_digest()
-        for stream, position in streams:
+        for position in status.streams:
+            try:
+                stream = self.ledger.stream(position.vehicle, position.epoch)
+            except WireError:  # no more epochs are taken: those that are known go on
+                continue
             link = self._link(stream)
             link.elsewhere = max(link.elsewhere, position.last)
             ask = ask or position.evidence not in (b"", stream.evidence_id)

@@ -325,14 +325,12 @@ class Ledger:
             return Receipt.REFUSED, stream
         if self._full(stream.vehicle, len(data)):
             return Receipt.DROPPED, stream
-        if snapshot.maker and heartbeat:
-            stream.voucher = heartbeat
-            self._changes.append(Put(records.stream_key(records.VOUCHER, *stream.key), heartbeat))
+        parked = Parked(message, data, snapshot.prefix_digest, heartbeat if snapshot.maker else b"")
         if not self._may_begin(stream, message):
             if 0 in stream.parked:
                 return Receipt.DUPLICATE, stream
-            return self._park(stream, Parked(message, data, snapshot.prefix_digest)), stream
-        if not self._replace_prefix(stream, Parked(message, data, snapshot.prefix_digest)):
+            return self._park(stream, parked), stream
+        if not self._replace_prefix(stream, parked):
             return Receipt.REFUSED, stream
         self._fold_parked(stream)
         return Receipt.FOLDED, stream
@@ -349,6 +347,9 @@ class Ledger:
             return False
         self._changes.append(self._delete(stream, 0))
         self._changes.append(Put(records.message_key(*stream.key, 0), snapshot.data))
+        if snapshot.voucher:
+            stream.voucher = snapshot.voucher
+            self._changes.append(Put(records.stream_key(records.VOUCHER, *stream.key), snapshot.voucher))
         return True
 
     def _delete(self, stream: Stream, first: int) -> Delete:

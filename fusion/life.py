@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from fleet_seif.definite import is_positive_definite
 from fleet_seif.errors import NumericalError
-from fleet_seif.information import H_QUANTUM, FrameDelta, FrameTotal, largest_growth
+from fleet_seif.information import H_QUANTUM, FrameDelta, FrameTotal, largest_growth, quanta
 from fleet_seif.messages import DeltaMessage, FramePart, FrameStatus, Hello
 from fleet_seif.records import Floats
 from fleet_seif.streams import is_check_point
@@ -146,9 +146,9 @@ def _absurd(part: FramePart, steps: int, hello: Hello) -> str | None:
     """Why a part claims more than its vehicle has said that it ever would; a correction may redo a whole frame."""
     if part.status is FrameStatus.CORRECTED:
         return None
-    most = steps * hello.step_information_max
+    most = steps * quanta(hello.step_information_max)
     if part.status is FrameStatus.OPENED:
-        most += hello.start_information
-    if largest_growth(part.delta) * H_QUANTUM <= most:
+        most += quanta(hello.start_information)
+    if largest_growth(part.delta) <= most:
         return None
-    return f"more information than the {most:g} per m^2 or rad^2 that its hello allows for {steps} steps"
+    return f"more information than the {most * H_QUANTUM:g} per m^2 or rad^2 that its hello allows for {steps} steps"

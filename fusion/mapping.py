@@ -1,5 +1,6 @@
 """From the ledger to a served map."""
 
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from fleet_seif.config import FusionSettings
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import Life, landmark_classes, marginal_covariances, solve
+from fleet_seif.joint import Life, marginal_covariances, solve
 from fleet_seif.messages import JointMap, LandmarkName, VehicleState
 from fusion.core import FusionCore
 
@@ -61,22 +62,28 @@ def make_map(taken: MapInput, version: int, settings: FusionSettings, *, final: 
     try:
         return _solved(taken, taken.checked, taken.classes, version, settings, final=final, canonical=canonical)
     except NumericalError:
-        # positive definite, and yet too lopsided to be solved: nobody may take the map from the others
-        good = tuple(life for life in taken.checked if _can_be_solved(life))
-        names = {(life.vehicle, life.life) for life in good}
-        classes = tuple(tuple(name for name in group if name[:2] in names) for group in taken.classes)
+        # each positive definite, and yet too lopsided or contradictory to be solved: nobody takes the map from all
+        good = _that_can_be_solved(taken.checked, taken.classes)
         taken = dataclasses.replace(taken, counters={**taken.counters, LEFT_OUT: len(taken.checked) - len(good)})
-        kept = tuple(group for group in classes if group)
+        kept = _classes_of(good, taken.classes)
         return _solved(taken, good, kept, version, settings, final=final, canonical=canonical)
 
 
-def _can_be_solved(life: Life) -> bool:
-    """Whether what a life has contributed is a map on its own."""
-    try:
-        marginal_covariances(solve([life], landmark_classes([life])))
-    except NumericalError:
-        return False
-    return True
+def _that_can_be_solved(lives: tuple[Life, ...], classes: Classes) -> tuple[Life, ...]:
+    """In canonical order, every life with which those before it can still be solved."""
+    kept: tuple[Life, ...] = ()
+    for life in lives:
+        with contextlib.suppress(NumericalError):
+            solve((*kept, life), _classes_of((*kept, life), classes))
+            kept = (*kept, life)
+    return kept
+
+
+def _classes_of(lives: tuple[Life, ...], classes: Classes) -> Classes:
+    """The classes without the names of other lives."""
+    names = {(life.vehicle, life.life) for life in lives}
+    groups = (tuple(name for name in group if name[:2] in names) for group in classes)
+    return tuple(sorted(group for group in groups if group))
 
 
 def _solved(

@@ -13,11 +13,12 @@ CHECK_DIGESTS_MAX = 10_000
 
 @dataclass(frozen=True)
 class Parked:
-    """A message that waits for an earlier one. prefix_digest: of a snapshot."""
+    """A message that waits for an earlier one. prefix_digest, voucher: of a snapshot."""
 
     message: DeltaMessage
     data: bytes
     prefix_digest: bytes | None = None
+    voucher: bytes = b""
 
 
 @dataclass(eq=False)

@@ -42,7 +42,6 @@ class Arena:
     """A scenario's world, and what its vehicles contribute where nothing goes wrong."""
 
     def __init__(self, scenario: Scenario) -> None:
-        logging.getLogger().setLevel(logging.CRITICAL)  # refused messages are what is wanted here
         self.scenario = scenario
         self.recording: Recording = record(scenario)
         self.expected = reference(scenario, self.recording)
@@ -87,6 +86,7 @@ _arena: Arena | None = None
 
 def _prepare(scenario: str) -> None:
     global _arena  # noqa: PLW0603 - one for each worker process
+    logging.getLogger().setLevel(logging.CRITICAL)  # refused messages are what is wanted here
     _arena = Arena(Scenario.model_validate_json(scenario))
 
 

@@ -215,7 +215,6 @@ def test_a_node_catches_up_from_a_snapshot_that_is_older_than_the_last_witness()
     assert caught_up_from(core).next == 130
 
 
-@pytest.mark.xfail(strict=True, reason="fusion/ledger._accept_snapshot: the voucher is taken before the snapshot is")
 def test_a_snapshot_that_is_refused_leaves_the_voucher_of_the_one_that_is_held() -> None:
     core, node = core_with(70, FusionSettings()), FusionCore(FLEET, "two", FusionSettings())
     core.compact()

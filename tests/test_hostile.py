@@ -1033,7 +1033,6 @@ def test_frames_of_next_to_nothing_do_not_take_the_map_from_others() -> None:
     decode_map(encode_map(joint))
 
 
-@pytest.mark.xfail(strict=True, reason="fusion/mapping.make_map: each can be solved alone, all together cannot")
 def test_a_start_pose_that_is_far_off_does_not_take_the_map_from_others() -> None:
     """By 100 m, and said to be known to a centimetre: Gauss-Newton over all finds no end."""
     core, epoch = node_with_the_honest(), Epoch(2, 1)
@@ -1047,7 +1046,6 @@ def test_a_start_pose_that_is_far_off_does_not_take_the_map_from_others() -> Non
     assert set(HONEST) <= set(joint.poses)
 
 
-@pytest.mark.xfail(strict=True, reason="fusion/life._absurd rounds: each message is allowed, and their sum is not")
 def test_information_at_its_limit_can_be_compacted_and_restored() -> None:
     """The start fills a float to the last bit, so that what each step may add is rounded up or down."""
     core, step, most = FusionCore(FLEET, "fusion", FusionSettings()), 17, H(1e9)
@@ -1060,7 +1058,6 @@ def test_information_at_its_limit_can_be_compacted_and_restored() -> None:
         assert restored(ledger).map_digest() == ledger.map_digest()
 
 
-@pytest.mark.xfail(strict=True, reason="fusion/core.on_status: one stream too many, and the whole status is refused")
 def test_epochs_that_differ_between_nodes_do_not_keep_them_from_each_other() -> None:
     """Each node has as many of eve's epochs as it takes, and they are not the same."""
     nodes = [FusionCore(FLEET, name, FusionSettings()) for name in ("a", "b")]
@@ -1074,9 +1071,6 @@ def test_epochs_that_differ_between_nodes_do_not_keep_them_from_each_other() -> 
     assert any(isinstance(e, AskRange) and e.vehicle == "ann" for e in nodes[1].tick(1.0))
 
 
-@pytest.mark.xfail(
-    strict=True, reason="fusion/core.on_heartbeat: a digest said again keeps its age and is forgotten first"
-)
 def test_what_a_heartbeat_has_just_said_is_known() -> None:
     core = node_with_the_honest()
     for last in range(70, 90):
