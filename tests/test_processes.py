@@ -180,7 +180,12 @@ def test_a_killed_launcher_takes_its_processes_with_it() -> None:
 
 def test_a_vehicle_that_dies_ends_the_run_with_its_name() -> None:
     with slow_run() as (run, children):
-        victim = next(pid for pid in children if b"--name\0v2\0" in command_line(pid))
+
+        def named() -> list[int]:  # a process that has just been forked still bears its parent's command line
+            return [pid for pid in children if b"--name\0v2\0" in command_line(pid)]
+
+        wait_until(lambda: bool(named()), "the command line of v2")
+        (victim,) = named()
         os.kill(victim, signal.SIGKILL)
         _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 1
