@@ -58,6 +58,8 @@ InsecureOption = Annotated[bool, typer.Option("--insecure", help="Allow unencryp
 FleetOption = Annotated[
     str | None, typer.Option(help="Name of the fleet; the scenario's by default.", callback=_fleet_name)
 ]
+NamedFleetOption = Annotated[str, typer.Option("--fleet", help="Name of the fleet.", callback=_fleet_name)]
+EndpointsArgument = Annotated[list[str] | None, typer.Argument(help="Fusion nodes; tcp/127.0.0.1:7447 by default.")]
 StoreOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Where it keeps what it must not lose.")]
 SigningKeyOption = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Its private signing key.")]
 KeyRingOption = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="Public keys of the fleet.")]
@@ -240,8 +242,8 @@ def vehicle(
 @app.command("watch")
 @_clear_errors()
 def watch_map(
-    endpoint: Annotated[list[str] | None, typer.Argument(help="Fusion nodes; tcp/127.0.0.1:7447 by default.")] = None,
-    fleet: Annotated[str, typer.Option(help="Name of the fleet.", callback=_fleet_name)] = "fleet",
+    endpoint: EndpointsArgument = None,
+    fleet: NamedFleetOption = "fleet",
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a map.")] = False,
     config: ConfigOption = None,
     insecure: InsecureOption = False,
@@ -255,8 +257,8 @@ def watch_map(
 @app.command()
 @_clear_errors()
 def status(
-    endpoint: Annotated[list[str] | None, typer.Argument(help="Fusion nodes; tcp/127.0.0.1:7447 by default.")] = None,
-    fleet: Annotated[str, typer.Option(help="Name of the fleet.", callback=_fleet_name)] = "fleet",
+    endpoint: EndpointsArgument = None,
+    fleet: NamedFleetOption = "fleet",
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
     config: ConfigOption = None,
     insecure: InsecureOption = False,
@@ -292,7 +294,7 @@ def compact(file: FileArgument, signing_key: SigningKeyOption = None) -> None:
 @_clear_errors()
 def keys(
     folder: Annotated[Path, typer.Argument(metavar="DIR", file_okay=False, help="Keep them here; made before: add.")],
-    fleet: Annotated[str, typer.Option(help="Name of the fleet.", callback=_fleet_name)] = "fleet",
+    fleet: NamedFleetOption = "fleet",
     node: Annotated[list[str] | None, typer.Option(help="A fusion node; each with an --endpoint.")] = None,
     endpoint: Annotated[
         list[str] | None, typer.Option(metavar="tls/HOST:PORT", help="Where others reach the --node of the same place.")

@@ -80,13 +80,11 @@ def ledger_info(file: Path, console: Console) -> Ledger:
     """Print what a store holds; every message is folded again."""
     fleet, node = _whose(file)
     ledger = output.read_ledger(file, fleet)
-    known = [s for s in ledger.streams.values() if s.hello is not None and s.hello.continues is not None]
-    continued = {(s.vehicle, s.hello.continues.epoch) for s in known if s.hello and s.hello.continues}
     table = Table(box=None)
     for head in ("vehicle", "life", "epoch", "messages", "bytes", "up to", "checked", "state"):
         table.add_column(head, justify="left" if head in ("vehicle", "state") else "right")
     for _, s in sorted(ledger.streams.items()):
-        state = s.quarantine or ("ended" if s.ended else "continued" if s.key in continued else "open")
+        state = s.quarantine or ("ended" if s.ended else "continued" if ledger.is_continued(s) else "open")
         counts = (s.number, s.epoch.counter, len(s.log), s.log_bytes, s.next - 1, s.checked)
         table.add_row(s.vehicle, *(str(count) for count in counts), state)
     size = file.stat().st_size

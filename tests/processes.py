@@ -123,7 +123,11 @@ class Child:
         return code
 
     def finish(self, patience_s: float = PATIENCE_S) -> None:
-        """Wait for a good end."""
+        """Say that nobody needs it any more, and wait for a good end."""
+        with contextlib.suppress(BrokenPipeError):
+            assert self.process.stdin is not None
+            self.process.stdin.write("release\n")
+            self.process.stdin.flush()
         assert self.end(patience_s) == 0, "".join(self.errors)
 
     def terminate(self) -> int:

@@ -88,6 +88,13 @@ class Fleet(RuleBasedStateMachine):
         self.streams = {key: list(messages) for key, messages in STREAMS.items()}
         self.honest_until = 8
 
+    def may_take_snapshots(self, node: str, key: tuple[str, Epoch]) -> bool:
+        """Where a vehicle lies, one node keeps single messages: proof is made of them, and without any there is none.
+
+        That limit is stated in the README.
+        """
+        return not self.lies or key[0] != "ann" or node != NODES[-1]
+
     @initialize(chosen=st.lists(st.sampled_from(LIES), max_size=3), instead=st.booleans(), all_is_sent=st.booleans())
     def vehicles(self, chosen: list[list[bytes]], instead: bool, all_is_sent: bool) -> None:
         """instead: the first lie is all that there is for its number; without, there is an honest message too."""
@@ -128,8 +135,8 @@ class Fleet(RuleBasedStateMachine):
 
     @rule(last=st.sampled_from(CHECK_POINTS), node=NODE)
     def a_snapshot_of_its_vehicle_arrives(self, last: int, node: str) -> None:
-        """Where a vehicle lies, nodes that have only the snapshot learn it from others: what it stands for was sent."""
-        if last < self.honest_until:
+        """What the snapshot stands for was sent."""
+        if last < self.honest_until and self.may_take_snapshots(node, ("ann", MAIN)):
             self.sent.update(dict.fromkeys(STREAMS["ann", MAIN][: last + 1], "ann"))
             self.nodes[node].ledger.accept(snapshot(last), "ann")
 
@@ -164,6 +171,8 @@ class Fleet(RuleBasedStateMachine):
             return
         for data in source.log:
             if kind_of(data) == KIND_SNAPSHOT:
+                if not self.may_take_snapshots(taker, key):
+                    return
                 held = decode_snapshot(data)
                 target.stream(*key).announced[held.message.last] = (held.prefix_digest, source.voucher)
             target.accept(data, key[0])
@@ -172,7 +181,7 @@ class Fleet(RuleBasedStateMachine):
     def a_node_forgets_single_messages(self, node: str, key: tuple[str, Epoch]) -> None:
         ledger = self.nodes[node].ledger
         stream = ledger.streams.get(key)
-        if stream is None or stream.checked < 0:
+        if stream is None or stream.checked < 0 or not self.may_take_snapshots(node, key):
             return
         digest = stream.check_digests[stream.checked]
         beat = Heartbeat(

@@ -202,6 +202,8 @@ def fusion_node(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     )  # fmt: skip
     assert node.stdout is not None
     assert node.stdin is not None
+    node.stdin.write("release\n")  # it need not stay for vehicles that might come back
+    node.stdin.flush()
     try:
         yield node, next(e["endpoint"] for line in node.stdout if (e := json.loads(line))["event"] == "listening")
     finally:
