@@ -146,19 +146,15 @@ def test_a_figure_is_drawn(finished: Path) -> None:
     assert (finished / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
-def hear_interrupts() -> None:
-    """A shell that starts us in the background leaves SIGINT ignored, and children inherit that."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 @contextlib.contextmanager
 def slow_run() -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
     """A run of two vehicles that takes minutes, once its three processes are there, and those."""
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)  # children inherit SIG_IGN
     run = subprocess.Popen(
         [*COMMAND, "run", "fleet", "--set", "fleet.vehicles=2", "--set", "run.rate_hz=1"],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        preexec_fn=hear_interrupts,
     )  # fmt: skip
+    signal.signal(signal.SIGINT, ours)
     try:
         wait_until(lambda: len(children_of(run.pid)) == 3, "three processes")
         yield run, children_of(run.pid)
