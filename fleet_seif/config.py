@@ -1,6 +1,6 @@
 """Settings shared by every process: frozen, keyword-only, unknown keys refused, units last in names."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -18,23 +18,36 @@ class Settings(BaseModel):
 
 
 class FilterSettings(Settings):
-    """The sparse extended information filter of one vehicle.
+    """The filter of one vehicle.
 
+    kind: "seif", sparsified as published; "eif", never sparsified; "eseif", exactly sparse: the pose is forgotten and
+    found again where too many landmarks would be linked to it.
     active_max: theta_x, the most landmarks that stay linked to the pose after a step.
-    relax_others: landmarks outside the local block whose mean is relaxed each step.
+    strength: by what SEIF chooses the links to cut: "normalised", "raw" (as published) or "kl", the cost of the cut.
+    soften: rho of soft sparsification; 1 cuts a link at once, less weakens it from step to step.
+    relax_others: landmarks outside the local block whose mean is relaxed each step, where changes have reached them.
+    mean: "amortised", or "exact" for a solution over the whole map after each step.
     gate: squared normalised innovation (chi-square, 2 degrees of freedom) above which a sighting is refused.
     gate_patience: refusals of one landmark in a row after which its next sighting is believed.
     start_information: of the frame's first pose, per m^2 and rad^2.
     step_information_max: the most that a diagonal entry of H may grow by in a step, per m^2 and rad^2; a reading that
     claims more is refused. The vehicle declares it, and fusion nodes hold it to it.
+    landmarks_max: landmarks of a frame, for which address space is reserved; a frame on the wire takes 32,767.
+    neighbours_max: links of a landmark to others; where a step would make more, its sighting is refused. Not for "eif".
     """
 
+    kind: Literal["seif", "eif", "eseif"] = "seif"
     active_max: Annotated[int, Field(ge=1, le=1000)] = 6
+    strength: Literal["normalised", "raw", "kl"] = "normalised"
+    soften: Annotated[float, Field(gt=0, le=1)] = 1.0
     relax_others: Annotated[int, Field(ge=0, le=10_000)] = 8
+    mean: Literal["amortised", "exact"] = "amortised"
     gate: Positive = 30.0
     gate_patience: Annotated[int, Field(ge=1, le=1000)] = 3
     start_information: Annotated[float, Field(gt=0, le=1e9)] = 1e6
     step_information_max: Annotated[float, Field(gt=0, le=1e9)] = 1e9
+    landmarks_max: Annotated[int, Field(ge=1, le=10_000_000)] = 32_767
+    neighbours_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
 
 
 class PublishSettings(Settings):

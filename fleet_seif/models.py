@@ -31,17 +31,40 @@ def move(model: int, x: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 @kernel
-def sight(model: int, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-    """Expected sighting of landmark y from pose x: h (2,), J_z_x (2, 3), J_z_y (2, 2). y = x's position is singular."""
-    dx, dy = y[0] - x[0], y[1] - x[1]
+def sight_numbers(
+    model: int, x: Floats, y0: float, y1: float
+) -> tuple[float, float, float, float, float, float, float, float, float, float]:
+    """`sight` without arrays, for kernels that cannot afford them: h, rows of (J_z_x, J_z_y) without the heading.
+
+    The order: h (2), J_z_x[0, :2], J_z_y[0], J_z_x[1, :2], J_z_y[1]. The heading's column is (0, `heading_column`).
+    """
+    dx, dy = y0 - x[0], y1 - x[1]
     if model == COMPASS_XY:
-        return np.array([dx, dy]), np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.eye(2)
+        return dx, dy, -1.0, 0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 1.0
     q = dx * dx + dy * dy
     d = math.sqrt(q)
-    h = np.array([d, wrap(math.atan2(dy, dx) - x[2])])
-    J_z_y = np.array([[dx / d, dy / d], [-dy / q, dx / q]])
-    J_z_x = np.array([[-dx / d, -dy / d, 0.0], [dy / q, -dx / q, -1.0]])
-    return h, J_z_x, J_z_y
+    bearing = wrap(math.atan2(dy, dx) - x[2])
+    return d, bearing, -dx / d, -dy / d, dx / d, dy / d, dy / q, -dx / q, -dy / q, dx / q
+
+
+@kernel
+def heading_column(model: int) -> float:
+    """d z[1] / d theta; d z[0] / d theta is zero in every model."""
+    return 0.0 if model == COMPASS_XY else -1.0
+
+
+@kernel
+def pose_rows_seen(model: int) -> int:
+    """How many of the pose's first entries sightings see: the heading takes no part with a compass."""
+    return 2 if model == COMPASS_XY else 3
+
+
+@kernel
+def sight(model: int, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Expected sighting of landmark y from pose x: h (2,), J_z_x (2, 3), J_z_y (2, 2). y = x's position is singular."""
+    h0, h1, x00, x01, y00, y01, x10, x11, y10, y11 = sight_numbers(model, x, y[0], y[1])
+    J_z_x = np.array([[x00, x01, 0.0], [x10, x11, heading_column(model)]])
+    return np.array([h0, h1]), J_z_x, np.array([[y00, y01], [y10, y11]])
 
 
 @kernel

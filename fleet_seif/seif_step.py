@@ -6,7 +6,7 @@ costs the same at any map size. On failure the arrays are as they were.
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -14,22 +14,34 @@ from fleet_seif.dense import cholesky_into, inverse_2x2, solve_lower_into, solve
 from fleet_seif.information import B_QUANTUM, H_QUANTUM, QUANTA_MAX
 from fleet_seif.jit import kernel
 from fleet_seif.local_updates import (
+    RAW,
+    forget_pose_into,
+    link_strengths,
     measurement_update_into,
     motion_update_into,
     sparsify_into,
     squared_innovation,
     weakest_links,
 )
-from fleet_seif.models import RANGE_BEARING, place
+from fleet_seif.models import RANGE_BEARING, place, pose_rows_seen
 from fleet_seif.records import Floats, Ints
-
-LANDMARKS: Final = 0
-LINKS: Final = 1
-ACTIVE: Final = 2
-CURSOR: Final = 3
-DEGREE_MAX: Final = 4
+from fleet_seif.seif_arrays import (
+    ACTIVE,
+    DEGREE_MAX,
+    LANDMARKS,
+    LINKS,
+    QUEUE_FIRST,
+    QUEUE_LAST,
+    QUEUED,
+    SeifArrays,
+    arrays,
+)
 
 ASYMMETRY_MAX: Final = 1e-9
+SOFT_LEAST: Final = 1e-4
+"""Strength below which a link that is being weakened is cut."""
+LAG_MAX: Final = 1e-2
+"""Shift of a mean, in units of its conditional sigma, squared, from which on its neighbours are relaxed too."""
 
 OK: Final = 0
 NOT_FINITE: Final = 1
@@ -40,38 +52,9 @@ TOO_LARGE: Final = 5
 BAD_RANGE: Final = 6
 ABSURD: Final = 7
 
-
-class SeifArrays(NamedTuple):
-    """The filter's state. N, K, E, A are capacities for landmarks, neighbours, links and active landmarks.
-
-    counts: how much of each is used, indexed by LANDMARKS ... DEGREE_MAX.
-    mu_x (3,), b_x (3,), H_xx (3, 3); active (A,) ascending; H_xa (A, 3, 2).
-    mu_y (N, 2), b_y (N, 2), H_yy (N, 2, 2); degree (N,); neighbour (N, K); link (N, K) into H_link.
-    H_link (E, 2, 2): rows of the lower landmark, columns of the higher.
-    q_*: the same quantities as last published, in quanta. refusals (N,): in a row. local (N,): scratch, -1.
-    """
-
-    counts: Ints
-    mu_x: Floats
-    b_x: Floats
-    H_xx: Floats
-    active: Ints
-    H_xa: Floats
-    mu_y: Floats
-    b_y: Floats
-    H_yy: Floats
-    degree: Ints
-    neighbour: Ints
-    link: Ints
-    H_link: Floats
-    q_b_x: Ints
-    q_xx: Ints
-    q_xa: Ints
-    q_b_y: Ints
-    q_yy: Ints
-    q_link: Ints
-    refusals: Ints
-    local: Ints
+SEIF: Final = 0
+EIF: Final = 1
+ESEIF: Final = 2
 
 
 @kernel
@@ -100,12 +83,15 @@ def gather(s: SeifArrays, ids: Ints) -> tuple[Floats, Floats, Floats, Ints, Floa
     n, known = 3 + 2 * m, s.counts[LANDMARKS]
     H, b, mu, pull = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n)
     links = np.full((m, m), -1, np.int64)
-    H[:3, :3], b[:3], mu[:3] = s.H_xx, s.b_x, s.mu_x
+    for r in range(3):
+        b[r], mu[r] = s.b_x[r], s.mu_x[r]
+        for c in range(3):
+            H[r, c] = s.H_xx[r, c]
     for i in range(m):
         if ids[i] < known:
-            s.local[ids[i]] = i
+            s.local[ids[i]] = i + 1
     for a in range(s.counts[ACTIVE]):
-        at = 3 + 2 * s.local[s.active[a]]
+        at = 1 + 2 * s.local[s.active[a]]
         for r in range(3):
             for c in range(2):
                 H[r, at + c] = H[at + c, r] = s.H_xa[a, r, c]
@@ -113,26 +99,31 @@ def gather(s: SeifArrays, ids: Ints) -> tuple[Floats, Floats, Floats, Ints, Floa
         y, at = ids[i], 3 + 2 * i
         if y >= known:
             continue
+        b[at], b[at + 1] = s.b_y[y, 0], s.b_y[y, 1]
+        mu[at], mu[at + 1] = s.mu_y[y, 0], s.mu_y[y, 1]
         for r in range(2):
-            b[at + r], mu[at + r] = s.b_y[y, r], s.mu_y[y, r]
             for c in range(2):
                 H[at + r, at + c] = s.H_yy[y, r, c]
-        for k in range(s.degree[y]):
-            other, e = s.neighbour[y, k], s.link[y, k]
-            j = s.local[other]
-            if j > i:
+        half = s.first[y] - 1
+        while half >= 0:
+            e, side = half >> 1, half & 1
+            other = s.ends[e, 1 - side]
+            half = s.following[e, side] - 1
+            j = s.local[other] - 1
+            if j == -1:
+                h01, h10 = s.H_link[e, 0, 1], s.H_link[e, 1, 0]
+                if side == 1:
+                    h01, h10 = h10, h01
+                pull[at] += s.H_link[e, 0, 0] * s.mu_y[other, 0] + h01 * s.mu_y[other, 1]
+                pull[at + 1] += h10 * s.mu_y[other, 0] + s.H_link[e, 1, 1] * s.mu_y[other, 1]
+            elif side == 0:
                 links[i, j] = e
                 for r in range(2):
                     for c in range(2):
                         H[at + r, 3 + 2 * j + c] = H[3 + 2 * j + c, at + r] = s.H_link[e, r, c]
-            elif j == -1:
-                for r in range(2):
-                    for c in range(2):
-                        h = s.H_link[e, r, c] if y < other else s.H_link[e, c, r]
-                        pull[at + r] += h * s.mu_y[other, c]
     for i in range(m):
         if ids[i] < known:
-            s.local[ids[i]] = -1
+            s.local[ids[i]] = 0
     return H, b, mu, links, pull
 
 
@@ -150,27 +141,102 @@ def recover_mean_into(mu: Floats, H: Floats, b: Floats, pull: Floats) -> bool:
 
 
 @kernel
-def relax_others(s: SeifArrays, count: int) -> None:
-    """Eq. (49), (50) one landmark at a time, for the next `count` in turn: mu_j = H_jj^-1 (b_j - H_j. mu)."""
-    n = s.counts[LANDMARKS]
-    for _ in range(min(count, n)):
-        y = s.counts[CURSOR] % n
-        s.counts[CURSOR] = (y + 1) % n
-        r = s.b_y[y].copy()
-        for k in range(s.degree[y]):
-            other, e = s.neighbour[y, k], s.link[y, k]
-            for i in range(2):
-                for c in range(2):
-                    h = s.H_link[e, i, c] if y < other else s.H_link[e, c, i]
-                    r[i] -= h * s.mu_y[other, c]
-        for a in range(s.counts[ACTIVE]):
-            if s.active[a] == y:
-                for i in range(2):
-                    for c in range(3):
-                        r[i] -= s.H_xa[a, c, i] * s.mu_x[c]
-        H_inv = inverse_2x2(s.H_yy[y])
-        for i in range(2):
-            s.mu_y[y, i] = H_inv[i, 0] * r[0] + H_inv[i, 1] * r[1]
+def enqueue(s: SeifArrays, y: int) -> None:
+    """Let a landmark's mean be relaxed, after those that wait already; it must not be one of them."""
+    s.queue[y] = y + 1
+    if s.counts[QUEUED] > 0:
+        s.queue[s.counts[QUEUE_LAST]] = y + 1
+    else:
+        s.counts[QUEUE_FIRST] = y
+    s.counts[QUEUE_LAST] = y
+    s.counts[QUEUED] += 1
+
+
+@kernel
+def enqueue_neighbours(s: SeifArrays, y: int) -> None:
+    """Those of a landmark that are not marked in `local`."""
+    half = s.first[y] - 1
+    while half >= 0:
+        e, side = half >> 1, half & 1
+        other = s.ends[e, 1 - side]
+        half = s.following[e, side] - 1
+        if s.queue[other] == 0 and s.local[other] == 0:
+            enqueue(s, other)
+
+
+@kernel
+def lags(H_yy: Floats, d0: float, d1: float) -> bool:
+    """Whether a landmark's mean has moved far enough for its neighbours to follow: d' H_yy d > LAG_MAX."""
+    return bool(d0 * d0 * H_yy[0, 0] + 2.0 * d0 * d1 * H_yy[0, 1] + d1 * d1 * H_yy[1, 1] > LAG_MAX)
+
+
+@kernel
+def enqueue_around(s: SeifArrays, ids: Ints, known: int, mu: Floats, before: Floats) -> None:
+    """The neighbours, outside the block, of its landmarks whose means have moved far."""
+    for y in ids:
+        s.local[y] = 1
+    for i in range(len(ids)):
+        at = 3 + 2 * i
+        if ids[i] < known and lags(s.H_yy[ids[i]], mu[at] - before[at], mu[at + 1] - before[at + 1]):
+            enqueue_neighbours(s, ids[i])
+    for y in ids:
+        s.local[y] = 0
+
+
+@kernel
+def relax(s: SeifArrays, y: int) -> tuple[float, float]:
+    """Eq. (49), (50) for one landmark: mu_y = H_yy^-1 (b_y - the rest of its row). Returns by how much it moved."""
+    r0, r1 = s.b_y[y, 0], s.b_y[y, 1]
+    half = s.first[y] - 1
+    while half >= 0:
+        e, side = half >> 1, half & 1
+        other = s.ends[e, 1 - side]
+        half = s.following[e, side] - 1
+        h01, h10 = s.H_link[e, 0, 1], s.H_link[e, 1, 0]
+        if side == 1:
+            h01, h10 = h10, h01
+        r0 -= s.H_link[e, 0, 0] * s.mu_y[other, 0] + h01 * s.mu_y[other, 1]
+        r1 -= h10 * s.mu_y[other, 0] + s.H_link[e, 1, 1] * s.mu_y[other, 1]
+    for a in range(s.counts[ACTIVE]):
+        if s.active[a] == y:
+            for c in range(3):
+                r0 -= s.H_xa[a, c, 0] * s.mu_x[c]
+                r1 -= s.H_xa[a, c, 1] * s.mu_x[c]
+    H_inv = inverse_2x2(s.H_yy[y])
+    new0, new1 = H_inv[0, 0] * r0 + H_inv[0, 1] * r1, H_inv[1, 0] * r0 + H_inv[1, 1] * r1
+    d0, d1 = new0 - s.mu_y[y, 0], new1 - s.mu_y[y, 1]
+    s.mu_y[y, 0], s.mu_y[y, 1] = new0, new1
+    return d0, d1
+
+
+@kernel
+def relax_queued(s: SeifArrays, count: int) -> None:
+    """Relax up to `count` of the landmarks that wait; where one moves far, its neighbours wait next."""
+    for _ in range(min(count, s.counts[QUEUED])):
+        y = s.counts[QUEUE_FIRST]
+        s.counts[QUEUE_FIRST] = s.queue[y] - 1
+        s.queue[y] = 0
+        s.counts[QUEUED] -= 1
+        d0, d1 = relax(s, y)
+        if lags(s.H_yy[y], d0, d1):
+            enqueue_neighbours(s, y)
+
+
+@kernel
+def relocate_into(
+    H: Floats, b: Floats, mu: Floats, pull: Floats, model: int, at: Ints, z: Floats, Z: Floats, held: Ints
+) -> bool:  # fmt: skip
+    """ESEIF: forget where the pose is, and find it again from the sightings that were held back.
+
+    They are linearised where all the others have put it. False, leaving the block unusable, where H is not PD.
+    """
+    if not recover_mean_into(mu, H, b, pull):
+        return False
+    forget_pose_into(H, b, model)
+    for k in range(len(z)):
+        if held[k]:
+            measurement_update_into(H, b, mu, model, z[k], Z[k], at[k])
+    return True
 
 
 @kernel
@@ -212,12 +278,13 @@ def connect(s: SeifArrays, ids: Ints, H: Floats, links: Ints) -> None:
                 e = s.counts[LINKS]
                 s.counts[LINKS] += 1
                 links[i, j] = e
-                s.q_link[e] = 0
-                for y, other in ((ids[i], ids[j]), (ids[j], ids[i])):
-                    k = s.degree[y]
-                    s.neighbour[y, k], s.link[y, k] = other, e
-                    s.degree[y] = k + 1
-                    s.counts[DEGREE_MAX] = max(s.counts[DEGREE_MAX], k + 1)
+                s.ends[e, 0], s.ends[e, 1] = ids[i], ids[j]
+                for side in range(2):
+                    y = s.ends[e, side]
+                    s.following[e, side] = s.first[y]
+                    s.first[y] = 1 + 2 * e + side
+                    s.degree[y] += 1
+                    s.counts[DEGREE_MAX] = max(s.counts[DEGREE_MAX], s.degree[y])
 
 
 @kernel
@@ -285,48 +352,73 @@ def block_delta(ids: Ints, q_H: Ints, q_b: Ints, old_H: Ints, old_b: Ints) -> tu
 
 @kernel
 def published(s: SeifArrays, ids: Ints, links: Ints) -> tuple[Ints, Ints]:
-    """The block in quanta as it was last published."""
+    """The block in quanta as it was last published; the upper triangle of H."""
     n, known = 3 + 2 * len(ids), s.counts[LANDMARKS]
     q_H, q_b = np.zeros((n, n), np.int64), np.zeros(n, np.int64)
-    q_H[:3, :3], q_b[:3] = s.q_xx, s.q_b_x
+    for r in range(3):
+        q_b[r] = s.q_b_x[r]
+        for c in range(3):
+            q_H[r, c] = s.q_xx[r, c]
     a = 0
     for i in range(len(ids)):
-        at = 3 + 2 * i
-        if a < s.counts[ACTIVE] and s.active[a] == ids[i]:
-            q_H[:3, at : at + 2] = s.q_xa[a]
+        y, at = ids[i], 3 + 2 * i
+        if a < s.counts[ACTIVE] and s.active[a] == y:
+            for r in range(3):
+                q_H[r, at], q_H[r, at + 1] = s.q_xa[a, r, 0], s.q_xa[a, r, 1]
             a += 1
-        if ids[i] < known:
-            q_H[at : at + 2, at : at + 2], q_b[at : at + 2] = s.q_yy[ids[i]], s.q_b_y[ids[i]]
+        if y < known:
+            for r in range(2):
+                q_b[at + r] = s.q_b_y[y, r]
+                q_H[at + r, at], q_H[at + r, at + 1] = s.q_yy[y, r, 0], s.q_yy[y, r, 1]
         for j in range(i + 1, len(ids)):
-            if links[i, j] != -1:
+            e, to = links[i, j], 3 + 2 * j
+            if e != -1:
                 for r in range(2):
-                    for c in range(2):
-                        q_H[at + r, 3 + 2 * j + c] = s.q_link[links[i, j], r, c]
+                    q_H[at + r, to], q_H[at + r, to + 1] = s.q_link[e, r, 0], s.q_link[e, r, 1]
     return q_H, q_b
 
 
 @kernel
 def scatter(s: SeifArrays, ids: Ints, links: Ints, H: Floats, b: Floats, mu: Floats, q_H: Ints, q_b: Ints) -> None:
     """Write a block back."""
-    s.H_xx[:], s.b_x[:], s.mu_x[:] = H[:3, :3], b[:3], mu[:3]
-    s.q_xx[:], s.q_b_x[:] = q_H[:3, :3], q_b[:3]
+    for r in range(3):
+        s.b_x[r], s.mu_x[r], s.q_b_x[r] = b[r], mu[r], q_b[r]
+        for c in range(3):
+            s.H_xx[r, c], s.q_xx[r, c] = H[r, c], q_H[r, c]
     active = 0
     for i in range(len(ids)):
         y, at = ids[i], 3 + 2 * i
         if touches(H, 0, 3, at):
-            s.active[active], s.H_xa[active] = y, H[:3, at : at + 2]
-            s.q_xa[active] = q_H[:3, at : at + 2]
+            s.active[active] = y
+            for r in range(3):
+                for c in range(2):
+                    s.H_xa[active, r, c], s.q_xa[active, r, c] = H[r, at + c], q_H[r, at + c]
             active += 1
-        s.H_yy[y], s.q_yy[y] = H[at : at + 2, at : at + 2], q_H[at : at + 2, at : at + 2]
-        s.b_y[y], s.mu_y[y], s.q_b_y[y] = b[at : at + 2], mu[at : at + 2], q_b[at : at + 2]
+        for r in range(2):
+            s.b_y[y, r], s.mu_y[y, r], s.q_b_y[y, r] = b[at + r], mu[at + r], q_b[at + r]
+            for c in range(2):
+                s.H_yy[y, r, c], s.q_yy[y, r, c] = H[at + r, at + c], q_H[at + r, at + c]
         for j in range(i + 1, len(ids)):
             e, to = links[i, j], 3 + 2 * j
             if e != -1:
                 for r in range(2):
                     for c in range(2):
-                        s.H_link[e, r, c] = H[at + r, to + c]
-                        s.q_link[e, r, c] = q_H[at + r, to + c]
+                        s.H_link[e, r, c], s.q_link[e, r, c] = H[at + r, to + c], q_H[at + r, to + c]
     s.counts[ACTIVE] = active
+
+
+@kernel
+def higher_neighbours(s: SeifArrays, y: int) -> tuple[Ints, Ints]:
+    """The neighbours of a landmark with higher numbers, and the links to them."""
+    others, edges = np.empty(s.degree[y], np.int64), np.empty(s.degree[y], np.int64)
+    found, half = 0, s.first[y] - 1
+    while half >= 0:
+        e, side = half >> 1, half & 1
+        if side == 0:
+            others[found], edges[found] = s.ends[e, 1], e
+            found += 1
+        half = s.following[e, side] - 1
+    return others[:found], edges[:found]
 
 
 @kernel
@@ -353,13 +445,13 @@ def published_total(s: SeifArrays) -> tuple[Ints, Ints, Ints, Ints, Ints]:
         rows[k] = cols[k] = y + 1
         H[h], H[h + 1], H[h + 2] = s.q_yy[y, 0, 0], s.q_yy[y, 0, 1], s.q_yy[y, 1, 1]
         h += 3
-        for i in np.argsort(s.neighbour[y, : s.degree[y]]):
-            if s.neighbour[y, i] > y:
-                k += 1
-                rows[k], cols[k] = y + 1, s.neighbour[y, i] + 1
-                for r in range(2):
-                    H[h], H[h + 1] = s.q_link[s.link[y, i], r, 0], s.q_link[s.link[y, i], r, 1]
-                    h += 2
+        others, edges = higher_neighbours(s, y)
+        for i in np.argsort(others):
+            k += 1
+            rows[k], cols[k] = y + 1, others[i] + 1
+            for r in range(2):
+                H[h], H[h + 1] = s.q_link[edges[i], r, 0], s.q_link[edges[i], r, 1]
+                h += 2
     return variables, rows, cols, H[:h].copy(), b
 
 
@@ -392,12 +484,13 @@ def check_reading(model: int, u: Floats, cov: Floats, z: Floats, Z: Floats) -> i
 @kernel
 def accept_sightings(
     s: SeifArrays, H: Floats, mu: Floats, ids: Ints, model: int, at: Ints, z: Floats, Z: Floats,
-    gate: float, patience: int, fresh: Ints,
+    gate: float, patience: int, fresh: Ints, full: Ints,
 ) -> tuple[Ints, float, int, bool]:  # fmt: skip
     """Which sightings enter: (s,) of 0 or 1; the sum of squared normalised innovations of those, their number; PD.
 
     A sighting of a known landmark enters if its squared normalised innovation is at most `gate`, or if the landmark
-    was refused `patience` times in a row: then the map is wrong, not the sighting.
+    was refused `patience` times in a row: then the map is wrong, not the sighting. One of a landmark that is `full`
+    never does.
     """
     accepted = np.ones(len(at), np.int64)
     known = 3
@@ -409,6 +502,9 @@ def accept_sightings(
     total, used = 0.0, 0
     for k in range(len(at)):
         if at[k] >= known:
+            continue
+        if full[(at[k] - 3) // 2]:
+            accepted[k] = 0
             continue
         value = squared_innovation(L, known, mu, model, z[k], Z[k], at[k])
         y = ids[(at[k] - 3) // 2]
@@ -424,18 +520,76 @@ def accept_sightings(
 
 
 @kernel
+def full_landmarks(s: SeifArrays, ids: Ints, links: Ints, neighbours_max: int) -> Ints:
+    """Which landmarks of the block would have more neighbours than they may if it became linked throughout, (m,)."""
+    m = len(ids)
+    full = np.zeros(m, np.int64)
+    for i in range(m):
+        if ids[i] < s.counts[LANDMARKS]:
+            more = 0
+            for j in range(m):
+                more += j != i and links[min(i, j), max(i, j)] == -1
+            full[i] = s.degree[ids[i]] + more > neighbours_max
+    return full
+
+
+@kernel
+def held_back(H: Floats, ids: Ints, known: int, at: Ints, accepted: Ints, active_max: int, least: int) -> Ints:
+    """The sightings that ESEIF keeps for relocating the pose, (s,) of 0 or 1; none where it need not or cannot.
+
+    It need not where at most active_max landmarks would be linked to the pose. It cannot where fewer than `least` known
+    landmarks are in view.
+    """
+    m = len(ids)
+    linked, chosen = np.zeros(m, np.int64), np.zeros(m, np.int64)
+    held = np.zeros(len(at), np.int64)
+    for i in range(m):
+        linked[i] = touches(H, 0, 3, 3 + 2 * i)
+    for k in range(len(at)):
+        linked[(at[k] - 3) // 2] |= accepted[k]
+    if np.sum(linked) <= active_max:
+        return held
+    count = 0
+    for k in range(len(at)):
+        i = (at[k] - 3) // 2
+        if accepted[k] and ids[i] < known and (chosen[i] or count < active_max):
+            count += 1 - chosen[i]
+            chosen[i] = held[k] = 1
+    return held if count >= least else np.zeros(len(at), np.int64)
+
+
+@kernel
+def sparsify_block(H: Floats, b: Floats, mu: Floats, active_max: int, measure: int, soften: float) -> bool:
+    """Cut the weakest links beyond active_max, or weaken them (`soften` < 1). False where H is not PD."""
+    strength = link_strengths(H, measure)
+    drop = weakest_links(strength, active_max)
+    if len(drop) == 0:
+        return True
+    if soften < 1.0:
+        weak = drop[strength[drop] < SOFT_LEAST]
+        if len(weak) > 0 and not sparsify_into(H, b, mu, weak, 1.0):
+            return False
+        drop = drop[strength[drop] >= SOFT_LEAST]
+        if len(drop) == 0:
+            return True
+    return sparsify_into(H, b, mu, drop, soften)
+
+
+@kernel
 def seif_step(
-    s: SeifArrays, model: int, moves: bool, u: Floats, cov: Floats, sighted: Ints, z: Floats, Z: Floats,
-    active_max: int, others: int, gate: float, patience: int, growth_max: int,
+    floats: Floats, ints: Ints, model: int, moves: bool, u: Floats, cov: Floats, sighted: Ints, z: Floats, Z: Floats,
+    kind: int, active_max: int, measure: int, soften: float, others: int, gate: float, patience: int,
+    neighbours_max: int, growth_max: int,
 ) -> tuple[int, Floats, Ints, Ints, Ints, Ints, Ints]:  # fmt: skip
     """One step: motion (if `moves`), sightings of landmarks `sighted`, mean recovery, sparsification, delta.
 
     Landmark numbers from counts[LANDMARKS] on are new; capacities must suffice. growth_max: quanta by which a diagonal
-    entry of H may grow at most.
+    entry of H may grow at most. The other settings are those of FilterSettings.
 
     Returns: a code (OK ...), statistics (sum of squared innovations, sightings they come from, sightings refused), and
     the arrays of the FrameDelta.
     """
+    s = arrays(floats, ints)
     none = np.empty(0, np.int64)
     statistics = np.zeros(3)
     code = check_reading(model, u, cov, z, Z)
@@ -444,6 +598,13 @@ def seif_step(
     ids = block_ids(s.active[: s.counts[ACTIVE]], sighted)
     m, known = len(ids), s.counts[LANDMARKS]
     H, b, mu, links, pull = gather(s, ids)
+    if kind != EIF and s.counts[DEGREE_MAX] + m > neighbours_max:
+        full = full_landmarks(s, ids, links, neighbours_max)
+        cut = np.flatnonzero((full > 0) & (link_strengths(H, RAW) > 0.0))
+        if len(cut) > 0 and not sparsify_into(H, b, mu, cut, 1.0):
+            return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
+    else:
+        full = np.zeros(m, np.int64)
     refusals = np.zeros(m, np.int64)
     for i in range(m):
         if ids[i] < known:
@@ -451,23 +612,31 @@ def seif_step(
     if moves:
         motion_update_into(H, b, mu, model, u, cov)
     at = 3 + 2 * np.searchsorted(ids, sighted)
-    accepted, statistics[0], used, definite = accept_sightings(s, H, mu, ids, model, at, z, Z, gate, patience, refusals)
+    accepted, statistics[0], used, definite = accept_sightings(
+        s, H, mu, ids, model, at, z, Z, gate, patience, refusals, full
+    )
     if not definite:
         return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
     statistics[1], statistics[2] = used, len(z) - np.sum(accepted)
+    held = np.zeros(len(z), np.int64)
+    if kind == ESEIF:
+        held = held_back(H, ids, known, at, accepted, active_max, pose_rows_seen(model) - 1)
     for k in range(len(z)):
         y = (at[k] - 3) // 2
         if ids[y] >= known and H[at[k], at[k]] == 0.0:
             mu[at[k] : at[k] + 2] = place(model, mu[:3], z[k])
-        if accepted[k]:
+        if accepted[k] and not held[k]:
             measurement_update_into(H, b, mu, model, z[k], Z[k], at[k])
+    if np.any(held) and not relocate_into(H, b, mu, pull, model, at, z, Z, held):
+        return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
+    before = mu.copy()
     if not recover_mean_into(mu, H, b, pull):
         return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
-    drop = weakest_links(H, active_max)
-    if len(drop) > 0 and not sparsify_into(H, b, mu, drop):
+    if kind == SEIF and not sparsify_block(H, b, mu, active_max, measure, soften):
         return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
-    if not np.all(np.isfinite(mu)):
-        return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
+    for i in range(len(mu)):
+        if not math.isfinite(mu[i]):
+            return NOT_POSITIVE_DEFINITE, statistics, none, none, none, none, none
     q_H, q_b, fits = quantise(H, b, mu, row_entries(s, ids, H, links))
     if not fits:
         return TOO_LARGE, statistics, none, none, none, none, none
@@ -477,12 +646,50 @@ def seif_step(
             return ABSURD, statistics, none, none, none, none, none
     for i in range(m):
         if ids[i] >= known:
-            s.degree[ids[i]] = 0
-            s.local[ids[i]] = -1
             s.counts[LANDMARKS] = ids[i] + 1
         s.refusals[ids[i]] = refusals[i]
     connect(s, ids, H, links)
     variables, rows, cols, values, b_values = block_delta(ids, q_H, q_b, old_H, old_b)
     scatter(s, ids, links, H, b, mu, q_H, q_b)
-    relax_others(s, others)
+    if others > 0:
+        enqueue_around(s, ids, known, mu, before)
+        relax_queued(s, others)
     return OK, statistics, variables, rows, cols, values, b_values
+
+
+@kernel
+def blanket(s: SeifArrays, number: int) -> Ints:
+    """Landmarks in the combined Markov blanket of the pose and one landmark, ascending; see Seif.blanket_covariance.
+
+    Where the two do not meet, a breadth-first search from the landmark finds a shortest path to an active one; its cost
+    follows what lies in between.
+    """
+    n = s.counts[LANDMARKS]
+    active = s.active[: s.counts[ACTIVE]]
+    found, reached = np.empty(n, np.int64), 1
+    found[0], s.local[number] = number, number + 1
+    at, neighbours, meets = 0, 1, -1
+    while meets == -1 and at < reached:
+        y = found[at]
+        here = np.searchsorted(active, y)
+        if here < len(active) and active[here] == y:
+            meets = y
+        half = s.first[y] - 1
+        while half >= 0:
+            e, side = half >> 1, half & 1
+            other = s.ends[e, 1 - side]
+            half = s.following[e, side] - 1
+            if s.local[other] == 0:
+                s.local[other] = y + 1  # reached from there
+                found[reached] = other
+                reached += 1
+        if at == 0:
+            neighbours = reached
+        at += 1
+    ids = block_ids(active, found[:neighbours])
+    while meets != -1 and meets != number:
+        ids = block_ids(ids, np.array([meets]))
+        meets = s.local[meets] - 1
+    for k in range(reached):
+        s.local[found[k]] = 0
+    return ids

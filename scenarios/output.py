@@ -175,4 +175,5 @@ def read_drive(path: Path) -> DriveResult:
         messages=int(arrays["messages"]),
         readings_refused=int(arrays["readings_refused"]),
         sightings_refused=int(arrays["sightings_refused"]),
+        steps_beyond_active_max=int(arrays["steps_beyond_active_max"]),
     )

@@ -79,6 +79,7 @@ def _vehicle(run: FinishedRun, name: str) -> dict[str, Any]:
         **run.streams[name],
         "readings_refused": result.readings_refused,
         "sightings_refused": result.sightings_refused,
+        "steps_beyond_active_max": result.steps_beyond_active_max,
     }
 
 

@@ -9,7 +9,9 @@ from hypothesis.extra.numpy import arrays
 
 from fleet_seif.dense import cholesky_into
 from fleet_seif.local_updates import (
+    NORMALISED,
     add_outer_into,
+    link_strengths,
     measurement_update_into,
     motion_update_into,
     sparsify_into,
@@ -155,7 +157,7 @@ def blocks(draw: st.DrawFn) -> Block:
 def test_sparsification_is_equations_42_and_43(block: Block) -> None:
     H, b, mu = block.H.copy(), block.H @ block.mu, block.mu.copy()
     expected_H, expected_b = reference.sparsified(H, b, mu, block.rows(block.stay), block.rows(block.drop))
-    assert sparsify_into(H, b, mu, np.array(block.drop))
+    assert sparsify_into(H, b, mu, np.array(block.drop), 1.0)
     close(H, expected_H)
     close(b, expected_b)
     assert np.array_equal(H, H.T)
@@ -168,7 +170,7 @@ def test_sparsification_moves_the_vector_by_the_change_of_the_matrix_also_where_
 ) -> None:
     residual = data.draw(vectors(len(block.mu), 1.0))
     H, b = block.H.copy(), block.H @ block.mu + residual
-    assert sparsify_into(H, b, block.mu, np.array(block.drop))
+    assert sparsify_into(H, b, block.mu, np.array(block.drop), 1.0)
     close(b - H @ block.mu, residual)
 
 
@@ -176,7 +178,7 @@ def test_sparsification_moves_the_vector_by_the_change_of_the_matrix_also_where_
 @settled
 def test_sparsification_cuts_the_dropped_links_to_exactly_zero_and_no_others(block: Block) -> None:
     H = block.H.copy()
-    assert sparsify_into(H, H @ block.mu, block.mu, np.array(block.drop))
+    assert sparsify_into(H, H @ block.mu, block.mu, np.array(block.drop), 1.0)
     assert not np.any(H[:3, block.rows(block.drop)])
     assert not np.any(H[:3, block.rows(block.passive)])
     assert not np.any(H[block.rows(block.drop), :3])
@@ -186,7 +188,7 @@ def test_sparsification_cuts_the_dropped_links_to_exactly_zero_and_no_others(blo
 @settled
 def test_sparsification_keeps_the_matrix_positive_definite_and_an_exact_mean(block: Block) -> None:
     H, b = block.H.copy(), block.H @ block.mu
-    assert sparsify_into(H, b, block.mu, np.array(block.drop))
+    assert sparsify_into(H, b, block.mu, np.array(block.drop), 1.0)
     assert np.linalg.eigvalsh(H)[0] > 0.0
     np.testing.assert_allclose(np.linalg.solve(H, b), block.mu, rtol=0.0, atol=5e-8)
 
@@ -195,14 +197,14 @@ def test_sparsification_keeps_the_matrix_positive_definite_and_an_exact_mean(blo
 @settled
 def test_sparsification_never_makes_the_pose_more_certain_given_the_map(block: Block) -> None:
     H = block.H.copy()
-    assert sparsify_into(H, H @ block.mu, block.mu, np.array(block.drop))
+    assert sparsify_into(H, H @ block.mu, block.mu, np.array(block.drop), 1.0)
     assert np.linalg.eigvalsh(block.H[:3, :3] - H[:3, :3])[0] >= -1e-9
 
 
 def test_sparsification_refuses_a_block_whose_dropped_landmarks_hold_no_information() -> None:
     H = np.eye(5)
     H[3, 3] = -1.0
-    assert not sparsify_into(H, np.zeros(5), np.zeros(5), np.array([0]))
+    assert not sparsify_into(H, np.zeros(5), np.zeros(5), np.array([0]), 1.0)
 
 
 @given(blocks(), st.integers(0, 4))
@@ -213,7 +215,7 @@ def test_the_links_to_cut_are_the_weakest_normalised_ones(block: Block, active_m
         at = 3 + 2 * i
         strength[i] = sum(block.H[r, c] ** 2 / (block.H[r, r] * block.H[c, c]) for r in range(3) for c in (at, at + 1))
     strength = {i: s for i, s in strength.items() if s > 0}
-    drop = weakest_links(block.H, active_max).tolist()
+    drop = weakest_links(link_strengths(block.H, NORMALISED), active_max).tolist()
     assert len(drop) == max(len(strength) - active_max, 0)
     assert len(set(drop)) == len(drop)
     kept = [s for i, s in strength.items() if i not in drop]

@@ -11,6 +11,7 @@
 
 import contextlib
 import dataclasses
+import logging
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -22,12 +23,13 @@ import numpy as np
 from fleet_seif.config import FilterSettings, PublishSettings
 from fleet_seif.envelope import authenticate
 from fleet_seif.errors import NumericalError, ReadingRefused, RunError, WireError
+from fleet_seif.filters import StepResult
 from fleet_seif.geometry import act_all, compose
 from fleet_seif.information import FrameDelta
 from fleet_seif.messages import Ack, Continues, DeltaMessage, Epoch, FramePart, FrameStatus, Hello, check_name
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
-from fleet_seif.seif import Seif, StepResult
+from fleet_seif.seif import Seif
 from fleet_seif.signing import KeyRing, Role, Signer
 from fleet_seif.store import Change, Delete, Put
 from fleet_seif.wire import POSE_MAX, decode_ack, decode_range, encode_heartbeat, is_start_covariance
@@ -35,6 +37,7 @@ from vehicles import records
 from vehicles.outbox import Outbox
 from vehicles.records import EpochRecord, Trimmed
 
+log = logging.getLogger(__name__)
 SIGHTINGS_MAX = 1024
 EPOCHS_KEPT = 64
 STATE_BYTES_LEAST = 64 * 1024
@@ -62,6 +65,7 @@ class Counters:
 
     readings_refused: int = 0
     sightings_refused: int = 0
+    steps_beyond_active_max: int = 0
     acks_refused: int = 0
     messages: int = 0
     bytes_put: int = 0
@@ -342,6 +346,10 @@ class VehicleCore:
     def _append(self, time_s: float, result: StepResult, status: FrameStatus, hello: Hello | None) -> None:
         self.time_s = time_s
         self.counters.sightings_refused += result.refused
+        if self.filter.settings.kind != "eif" and result.active > self.filter.settings.active_max:
+            self.counters.steps_beyond_active_max += 1
+            if self.counters.steps_beyond_active_max == 1:
+                log.warning("bound_yields step=%d active=%d", self.steps, result.active)
         self._send(
             time_s=time_s,
             parts=(FramePart(frame=0, status=status, delta=result.delta),),

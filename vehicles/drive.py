@@ -22,7 +22,8 @@ class DriveResult:
 
     pose (T+1, 3): live estimate after each step. landmarks (n, 2), signatures (n,): its own live map at the end.
     filter_s, publish_s (T,): time spent on each step. bytes_put, messages: what it published.
-    readings_refused, sightings_refused: what its filter would not take.
+    readings_refused, sightings_refused: what its filter would not take. steps_beyond_active_max: after which more
+    landmarks were linked to the pose than the bound allows.
     """
 
     pose: Floats
@@ -34,6 +35,7 @@ class DriveResult:
     messages: int
     readings_refused: int
     sightings_refused: int
+    steps_beyond_active_max: int
 
 
 class Notes:
@@ -62,6 +64,7 @@ class Notes:
             messages=counters.messages,
             readings_refused=counters.readings_refused,
             sightings_refused=counters.sightings_refused,
+            steps_beyond_active_max=counters.steps_beyond_active_max,
         )
 
 

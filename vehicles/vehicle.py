@@ -22,11 +22,11 @@ from numpy.typing import ArrayLike
 
 from fleet_seif.bus import Bus
 from fleet_seif.config import FilterSettings, PublishSettings
+from fleet_seif.filters import StepResult
 from fleet_seif.keys import Keys
 from fleet_seif.messages import Epoch
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
-from fleet_seif.seif import StepResult
 from fleet_seif.signing import KeyRing, Signer
 from fleet_seif.sqlite_store import SqliteStore
 from fleet_seif.store import Store
