@@ -299,7 +299,8 @@ def smaller(schedule: Schedule) -> Iterator[Schedule]:
             yield schedule.model_copy(update={"link": link.model_copy(update={name: 0.0})})
     for i in range(len(link.cuts)):
         yield schedule.model_copy(update={"link": link.model_copy(update={"cuts": link.cuts[:i] + link.cuts[i + 1 :]})})
-    if schedule.nodes > 1 and not schedule.decisions:
+    named = f'"fusion{schedule.nodes}"' in schedule.model_dump_json()
+    if schedule.nodes > 1 and not schedule.decisions and not named:
         yield schedule.model_copy(update={"nodes": schedule.nodes - 1})
 
 

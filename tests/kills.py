@@ -37,6 +37,7 @@ PAUSE_S = (0.2, 2.8)  # between two kills
 AT_WORK = 0.7  # share of kills that hit somebody who is at work, and not just starting, where there is one
 DOWN_S = (0.0, 0.5)
 END_S = 120.0
+END_STEPS = 40
 
 
 class Acks:
@@ -84,11 +85,12 @@ def _digests(stream: Stream) -> Iterator[tuple[int, bytes]]:
 class Killer:
     """A fleet whose processes are killed and started again, one at a time."""
 
-    def __init__(self, fleet: Fleet, rng: random.Random) -> None:
+    def __init__(self, fleet: Fleet, rng: random.Random, steps: int) -> None:
         self.acks = Acks()
         self.killed = dict.fromkeys([*NODES, *VEHICLES], 0)
         self._fleet = fleet
         self._rng = rng
+        self._near_the_end = steps - END_STEPS
         self._running: dict[str, Child] = {}
         self._endpoints: dict[str, str] = {}
 
@@ -107,9 +109,19 @@ class Killer:
         else:
             self._running[name] = self._fleet.vehicle(name, list(self._endpoints.values()))
 
-    def kill_one(self) -> None:
-        """Kill somebody who has not finished, look at what a node then has, and start it again."""
-        running = [name for name, child in self._running.items() if child.running]
+    def _is_nearly_done(self, name: str) -> bool:
+        """Whether a vehicle may end while it is down: then the nodes, having everything, may end before it is back."""
+        told = self._running[name].find("progress")
+        return name in VEHICLES and bool(told and told["done"] >= self._near_the_end)
+
+    def kill_one(self) -> bool:
+        """Kill somebody who has not finished, look at what a node then has, and start it again.
+
+        False, with nobody killed, where the run is nearly over.
+        """
+        if all(self._is_nearly_done(name) for name in VEHICLES):
+            return False
+        running = [n for n, child in self._running.items() if child.running and not self._is_nearly_done(n)]
         at_work = [name for name in running if self._running[name].find("progress")]
         name = self._rng.choice(at_work if at_work and self._rng.random() < AT_WORK else running)
         self._running[name].kill()
@@ -118,15 +130,16 @@ class Killer:
             check_kept(read_ledger(self._fleet.store(name), NAME), self.acks.of(name))
         time.sleep(self._rng.uniform(*DOWN_S))
         self._start(name)
+        return True
 
     def finish(self) -> None:
-        """Wait until all have ended well."""
-        for child in self._running.values():
-            child.finish(END_S)
+        """Wait until all have ended well, the vehicles first: nodes wait for them."""
+        for name in [*VEHICLES, *NODES]:
+            self._running[name].finish(END_S)
 
 
 def survive(kills: int, seed: int, folder: Path, steps: int) -> dict[str, int]:
-    """A run with so many kills; returns who was killed how often.
+    """A run with up to so many kills; returns who was killed how often.
 
     Fails where a process ends badly, where something acknowledged is gone, or where the map is another.
     """
@@ -137,7 +150,7 @@ def survive(kills: int, seed: int, folder: Path, steps: int) -> dict[str, int]:
     )  # fmt: skip
     expected = run_virtual(SCENARIO, *settings).ledger.map_digest()
     with fleet_of(SCENARIO, folder, *settings) as fleet, contextlib.ExitStack() as stack:
-        killer = Killer(fleet, rng)
+        killer = Killer(fleet, rng, steps)
 
         def listen(endpoint: str) -> None:
             stack.enter_context(open_bus(connect=[endpoint])).subscribe(Keys(NAME).acks("*"), killer.acks.take)
@@ -145,7 +158,8 @@ def survive(kills: int, seed: int, folder: Path, steps: int) -> dict[str, int]:
         killer.start(listen)
         for _ in range(kills):
             time.sleep(rng.uniform(*PAUSE_S))
-            killer.kill_one()
+            if not killer.kill_one():
+                break
         killer.finish()
         for node in NODES:
             ledger = read_ledger(fleet.store(node), NAME)

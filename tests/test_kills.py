@@ -60,7 +60,7 @@ def test_ten_kills_of_a_launched_fleet_change_nothing(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_ten_kills_lose_nothing_that_was_acknowledged(tmp_path: Path) -> None:
-    killed = kills.survive(10, 11, tmp_path, STEPS)
+    killed = kills.survive(10, 11, tmp_path, 2 * STEPS)
     print(f"10 kills by hand: {killed}")
     assert sum(killed.values()) == 10
 
