@@ -38,6 +38,7 @@ AT_WORK = 0.7  # share of kills that hit somebody who is at work, and not just s
 DOWN_S = (0.0, 0.5)
 END_S = 120.0
 END_STEPS = 40
+UNREACHABLE = "cannot reach a fusion node"
 
 
 class Acks:
@@ -114,11 +115,19 @@ class Killer:
         told = self._running[name].find("progress")
         return name in VEHICLES and bool(told and told["done"] >= self._near_the_end)
 
+    def _start_again(self) -> None:
+        """Vehicles that found no node when they started, because both were down: what a supervisor is there for."""
+        for name in VEHICLES:
+            child = self._running[name]
+            if not child.running and child.end() != 0 and any(UNREACHABLE in line for line in child.errors):
+                self._start(name)
+
     def kill_one(self) -> bool:
         """Kill somebody who has not finished, look at what a node then has, and start it again.
 
         False, with nobody killed, where the run is nearly over.
         """
+        self._start_again()
         if all(self._is_nearly_done(name) for name in VEHICLES):
             return False
         running = [n for n, child in self._running.items() if child.running and not self._is_nearly_done(n)]
@@ -134,6 +143,7 @@ class Killer:
 
     def finish(self) -> None:
         """Wait until all have ended well, the vehicles first: nodes wait for them."""
+        self._start_again()
         for name in [*VEHICLES, *NODES]:
             self._running[name].finish(END_S)
 

@@ -124,7 +124,7 @@ class Child:
 
     def finish(self, patience_s: float = PATIENCE_S) -> None:
         """Say that nobody needs it any more, and wait for a good end."""
-        with contextlib.suppress(BrokenPipeError):
+        with contextlib.suppress(BrokenPipeError, ValueError):
             assert self.process.stdin is not None
             self.process.stdin.write("release\n")
             self.process.stdin.flush()
