@@ -32,6 +32,10 @@ class FilterSettings(Settings):
     start_information: of the frame's first pose, per m^2 and rad^2.
     step_information_max: the most that a diagonal entry of H may grow by in a step, per m^2 and rad^2; a reading that
     claims more is refused. The vehicle declares it, and fusion nodes hold it to it.
+    frames: "single", one frame for the whole run, as published; "adaptive", a frame is closed before its linearisation
+    goes wrong: after frame_steps_max steps, frame_landmarks_max landmarks, or once odometry has added up to a standard
+    deviation of frame_heading_std_max_rad.
+    close_lag_steps: steps after which the correction of a closed frame is published.
     landmarks_max: landmarks of a frame, for which address space is reserved; a frame on the wire takes 32,767.
     neighbours_max: links of a landmark to others; where a step would make more, its sighting is refused. Not for "eif".
     """
@@ -46,6 +50,11 @@ class FilterSettings(Settings):
     gate_patience: Annotated[int, Field(ge=1, le=1000)] = 3
     start_information: Annotated[float, Field(gt=0, le=1e9)] = 1e6
     step_information_max: Annotated[float, Field(gt=0, le=1e9)] = 1e9
+    frames: Literal["single", "adaptive"] = "single"
+    frame_steps_max: Annotated[int, Field(ge=1, le=10_000)] = 25
+    frame_landmarks_max: Annotated[int, Field(ge=2, le=1000)] = 60
+    frame_heading_std_max_rad: Positive = 0.5
+    close_lag_steps: Annotated[int, Field(ge=1, le=10_000)] = 2
     landmarks_max: Annotated[int, Field(ge=1, le=10_000_000)] = 32_767
     neighbours_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
 

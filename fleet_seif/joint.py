@@ -94,6 +94,13 @@ class JointSolution:
 Pair = tuple[LandmarkName, LandmarkName]
 
 
+def landmark_names(life: Life) -> list[LandmarkName]:
+    """The landmarks of a life, ascending; one whose rows are all zero in every frame is none."""
+    present = [delta.variables[delta.variables != POSE] - 1 for delta in life.frames]
+    numbers = np.unique(np.concatenate(present)).tolist() if present else []
+    return [LandmarkName(life.vehicle, life.life, number) for number in numbers]
+
+
 def landmark_classes(
     lives: Sequence[Life], forced: Sequence[Pair] = (), forbidden: Sequence[Pair] = ()
 ) -> tuple[tuple[LandmarkName, ...], ...]:
@@ -108,11 +115,9 @@ def landmark_classes(
     groups: dict[object, list[LandmarkName]] = {}
     names: list[LandmarkName] = []
     for life in lives:
-        present = [delta.variables[delta.variables != POSE] - 1 for delta in life.frames]
-        for number in np.unique(np.concatenate(present)).tolist() if present else []:
-            name = LandmarkName(life.vehicle, life.life, number)
+        for name in landmark_names(life):
             names.append(name)
-            signature = life.signatures[number]
+            signature = life.signatures[name.number]
             groups.setdefault(name if signature == UNKNOWN_SIGNATURE else signature, []).append(name)
     if forced or forbidden:
         same = [(group[0], other) for group in map(sorted, groups.values()) for other in group[1:]]

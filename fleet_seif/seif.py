@@ -79,6 +79,10 @@ class Seif:
         """Memory of all that is known about pose, landmarks and links; what is only reserved does not count."""
         return sum(int(part.nbytes) for part in seif_arrays.used(self._s).values()) + 8 * len(self.signatures)
 
+    def numbers_of(self, seen: Sightings) -> Ints:
+        """Landmark numbers of sightings that have been taken."""
+        return self._names.numbers(np.asarray(seen.signature))[0]
+
     def mean(self) -> Floats:
         """Pose, then landmarks by number, shape (3 + 2 n,)."""
         return np.concatenate([self.pose, self.landmarks.ravel()])

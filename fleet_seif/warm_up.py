@@ -1,5 +1,6 @@
 """Compiles or loads every kernel before a process says that it is ready."""
 
+import dataclasses
 import threading
 import time
 from collections.abc import Callable
@@ -8,6 +9,7 @@ import numpy as np
 
 from fleet_seif.config import FilterSettings
 from fleet_seif.definite import is_positive_definite
+from fleet_seif.frames import FramedFilter
 from fleet_seif.information import FrameTotal, largest_growth, to_information
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello
 from fleet_seif.records import Reading, Sightings
@@ -34,14 +36,18 @@ def warm_up(say: Callable[[str], None] = lambda text: None) -> float:
         signature=np.arange(3),
     )
     motion = Reading(time_s=1.0, odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=seen)
-    seif = Seif(FilterSettings(active_max=1))
+    framed = FramedFilter(FilterSettings(active_max=1, frames="adaptive", frame_steps_max=1, close_lag_steps=1))
+    backwards = dataclasses.replace(motion, sightings=dataclasses.replace(seen, signature=np.array([2, 1, 0])))
     total = FrameTotal()
-    for delta in (seif.start(seen).delta, seif.step(motion).delta):
+    total.add(framed.start(seen)[0].delta)
+    for _ in range(3):
+        framed.step(backwards)
+    for delta in framed.published():
         total.add(delta)
     to_information(total.delta())
     is_positive_definite(total.delta())
     largest_growth(total.delta())
-    seif.published()
+    Seif(FilterSettings()).published()
     part = FramePart(frame=0, status=FrameStatus.OPENED, delta=total.delta())
     hello = Hello(
         software="", life=0, placed=True, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)),

@@ -19,6 +19,8 @@ from fleet_seif.warm_up import warm_up
 from scenarios import chaos_runs, children, output, tools, watch
 from scenarios.access import Kind
 from scenarios.config import ScenarioError, load_scenario, shipped
+from scenarios.experiments.names import EXPERIMENTS, find_experiment, run_experiment, summary_table
+from scenarios.experiments.study import png_of, summary_of
 from scenarios.launch import run_processes
 from scenarios.progress import progress_bars
 from scenarios.report import evaluate, write_folder
@@ -340,6 +342,26 @@ def run_chaos(
     )
     if tally.failures:
         raise RunError("something that must always hold did not")
+
+
+@app.command()
+@_clear_errors()
+def experiment(
+    name: Annotated[str, typer.Argument(help=f"One of {', '.join(EXPERIMENTS)}.")],
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep figure, CSV and summary here; ./NAME.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first world; the others follow.")] = 1,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer worlds and steps: to try it, not to compare.")] = False,
+) -> None:
+    """Run an experiment of the SEIF paper: a figure, a CSV, and a summary that sets the paper's numbers beside ours."""
+    chosen = find_experiment(name)
+    folder = Path(name) if out is None else out
+    warm_up(_say)
+    with progress_bars(console, {f"{name}, %": 100}, quiet=False) as progress:
+        rows = run_experiment(
+            chosen, folder, seed, quick, lambda done, total: progress(f"{name}, %", 100 * done // total, 100)
+        )
+    console.print(summary_table(chosen, rows, quick))
+    _say(f"figure: {png_of(folder, name)}   summary: {summary_of(folder)}")
 
 
 def _endpoints(given: list[str] | None, config: Path | None) -> list[str]:

@@ -19,7 +19,7 @@ from tests.reference import same
 from tests.strategies import STEP_INFORMATION, STRONG, definite_deltas, pose_block, settled
 from vehicles.outbox import Outbox
 from vehicles.records import EPOCH as EPOCH_TABLE
-from vehicles.records import MESSAGE, TRIMMED, EpochRecord, Trimmed, numbered
+from vehicles.records import ENDS, MESSAGE, TRIMMED, EpochRecord, Trimmed, numbered
 
 EPOCH = Epoch(3, 4)
 WINDOW, OUTBOX_MAX = 5, 16
@@ -31,7 +31,7 @@ HELLO = Hello(
 
 
 def record() -> EpochRecord:
-    return EpochRecord(epoch=EPOCH, life=0, base=FrameDelta.nothing(), names=0)
+    return EpochRecord(epoch=EPOCH, life=0, base=(), ended=0, names=0)
 
 
 class OutboxMachine(RuleBasedStateMachine):
@@ -152,7 +152,8 @@ class OutboxMachine(RuleBasedStateMachine):
         self.outbox = Outbox(SETTINGS, record() if stored is None else EpochRecord.read(stored), required=self.required)
         trimmed = kept.get(numbered(TRIMMED, 0))
         messages = [kept[key] for key in sorted(kept) if key[:1] == MESSAGE]
-        self.outbox.restore(None if trimmed is None else Trimmed.read(trimmed), messages)
+        ends = {int.from_bytes(k[9:], "big"): np.frombuffer(v) for k, v in kept.items() if k[:1] == ENDS}
+        self.outbox.restore(None if trimmed is None else Trimmed.read(trimmed), ends, messages)
         last = -1 if trimmed is None else decode_message(Trimmed.read(trimmed).newest).last
         self.trimmed = sum(decode_message(data).last <= last for data in self.put)
         self.put, self.prefixes = self.put[: self.trimmed], self.prefixes[: self.trimmed]
@@ -161,7 +162,7 @@ class OutboxMachine(RuleBasedStateMachine):
         self.pending, self.acked, self.closed = None, {}, True
         self.ended = self.outbox.ended
         if self.effects:
-            self.outbox.close(self.effects[-1][0], self.signatures)
+            self.outbox.close((self.effects[-1][0],), self.signatures)
 
     @precondition(lambda self: self.put)
     @rule(data=st.data(), count=st.integers(1, 30))
@@ -178,7 +179,7 @@ class OutboxMachine(RuleBasedStateMachine):
 
     def answers(self, first: int, last: int, count: int) -> list[bytes]:
         request = RangeRequest(fleet="test", vehicle="v", epoch=EPOCH, first=first, last=last, count=count)
-        return self.outbox.answer(request, lambda: self.effects[-1][0], self.signatures)
+        return self.outbox.answer(request, lambda: (self.effects[-1][0],), self.signatures)
 
     @precondition(lambda self: self.put)
     @rule()

@@ -24,12 +24,11 @@ from fleet_seif.config import FilterSettings, PublishSettings
 from fleet_seif.envelope import authenticate
 from fleet_seif.errors import NumericalError, ReadingRefused, RunError, WireError
 from fleet_seif.filters import StepResult
+from fleet_seif.frames import FramedFilter
 from fleet_seif.geometry import act_all, compose
-from fleet_seif.information import FrameDelta
-from fleet_seif.messages import Ack, Continues, DeltaMessage, Epoch, FramePart, FrameStatus, Hello, check_name
+from fleet_seif.messages import Ack, Continues, DeltaMessage, Epoch, FramePart, Hello, check_name
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Reading, Sightings
-from fleet_seif.seif import Seif
 from fleet_seif.signing import KeyRing, Role, Signer
 from fleet_seif.store import Change, Delete, Put
 from fleet_seif.wire import POSE_MAX, decode_ack, decode_range, encode_heartbeat, is_start_covariance
@@ -107,7 +106,7 @@ class VehicleCore:
         check_name(identity.vehicle, "vehicle")
         _check_start(identity)
         self.identity = identity
-        self.filter = Seif(settings, model)
+        self.filter = FramedFilter(settings, model)
         self.counters = Counters()
         self.steps = 0
         self.ended = False
@@ -133,8 +132,9 @@ class VehicleCore:
         """Begin an epoch of a life: everything that follows belongs to it."""
         ordinal = self._outboxes[-1].ordinal + 1 if self._outboxes else 0
         record = EpochRecord(
-            epoch=self.identity.epoch, life=life, base=self.filter.published(), names=len(self.filter.signatures)
-        )
+            epoch=self.identity.epoch, life=life, base=self.filter.published(), ended=len(self.filter.ends),
+            names=len(self.filter.signatures),
+        )  # fmt: skip
         self._outboxes.append(
             Outbox(self._publish, record, ordinal=ordinal, required=self._required, signer=self._signer)
         )
@@ -147,7 +147,7 @@ class VehicleCore:
         ]
         while len(self._outboxes) > EPOCHS_KEPT and self._outboxes[0].done:
             gone = self._outboxes.pop(0).ordinal
-            tables = (records.EPOCH, records.MESSAGE, records.TRIMMED)
+            tables = (records.EPOCH, records.ENDS, records.MESSAGE, records.TRIMMED)
             self._kept += [Delete(records.numbered(t, gone), records.numbered(t, gone + 1)) for t in tables]
 
     def resume(self, stored: Iterable[tuple[bytes, bytes]], *, fresh: bool = False) -> bool:
@@ -226,7 +226,11 @@ class VehicleCore:
         trimmed = kept.get(records.numbered(records.TRIMMED, ordinal))
         stem = records.numbered(records.MESSAGE, ordinal)
         messages = [kept[name] for name in sorted(kept) if name.startswith(stem)]
-        outbox.restore(None if trimmed is None else Trimmed.read(trimmed), messages)
+        stem = records.numbered(records.ENDS, ordinal)
+        ends = {
+            int.from_bytes(name[9:], "big"): np.frombuffer(pose) for name, pose in kept.items() if name.startswith(stem)
+        }
+        outbox.restore(None if trimmed is None else Trimmed.read(trimmed), ends, messages)
         return outbox
 
     def _replay(self, kept: dict[bytes, bytes]) -> None:
@@ -238,7 +242,7 @@ class VehicleCore:
         for key in sorted(name for name in kept if name[:1] == records.READING):
             reading, mark = records.read_reading(kept[key])
             step = int.from_bytes(key[1:], "big")
-            result = self.filter.step(reading) if step else self.filter.start(reading.sightings)
+            result, _ = self.filter.step(reading) if step else self.filter.start(reading.sightings)
             if records.fingerprint(result.delta) != mark:
                 raise RunError(
                     f"step {step} gives another result than when the store was written, by another version or on"
@@ -249,9 +253,11 @@ class VehicleCore:
         newest = self.outbox.newest
         if newest is not None:
             self.healthy = newest.healthy
+        if self.outbox.ended:
+            self.filter.end()  # what it published then has been published
 
     def _forget_filter(self) -> None:
-        self.filter = Seif(self.filter.settings, self.filter.model)
+        self.filter = FramedFilter(self.filter.settings, self.filter.model)
         self.steps, self.time_s, self.healthy = 0, -math.inf, True
         self._kept += [Delete(table, records.after(table)) for table in (records.READING, records.STATE)]
 
@@ -270,9 +276,9 @@ class VehicleCore:
         self._check(time_s, sightings)
         if self.outbox.last >= 0:
             raise ReadingRefused("this vehicle has already started")
-        result = self.filter.start(sightings)
+        result, parts = self.filter.start(sightings)
         self._keep(Reading(time_s=time_s, odometry=np.zeros(3), odometry_cov=np.eye(3), sightings=sightings), result)
-        self._append(time_s, result, FrameStatus.OPENED, self._hello(None))
+        self._append(time_s, result, parts, self._hello(None))
         return result
 
     def _hello(self, continues: Continues | None) -> Hello:
@@ -313,7 +319,7 @@ class VehicleCore:
         if self.outbox.last < 0:
             raise ReadingRefused("the vehicle has not started: give what it sees before any motion to `start` first")
         try:
-            result = self.filter.step(reading)
+            result, parts = self.filter.step(reading)
         except ReadingRefused:
             self.counters.readings_refused += 1
             raise
@@ -323,7 +329,7 @@ class VehicleCore:
             raise
         self.steps += 1
         self._keep(reading, result)
-        self._append(reading.time_s, result, FrameStatus.CONTINUED, None)
+        self._append(reading.time_s, result, parts, None)
         return result
 
     def _check(self, time_s: float, sightings: Sightings) -> None:
@@ -343,7 +349,7 @@ class VehicleCore:
             self.counters.readings_refused += 1
             raise ReadingRefused(f"reading refused: {fault}")
 
-    def _append(self, time_s: float, result: StepResult, status: FrameStatus, hello: Hello | None) -> None:
+    def _append(self, time_s: float, result: StepResult, parts: tuple[FramePart, ...], hello: Hello | None) -> None:
         self.time_s = time_s
         self.counters.sightings_refused += result.refused
         if self.filter.settings.kind != "eif" and result.active > self.filter.settings.active_max:
@@ -352,7 +358,7 @@ class VehicleCore:
                 log.warning("bound_yields step=%d active=%d", self.steps, result.active)
         self._send(
             time_s=time_s,
-            parts=(FramePart(frame=0, status=status, delta=result.delta),),
+            parts=parts,
             landmarks=tuple((result.first_new + i, signature) for i, signature in enumerate(result.new)),
             innovation=result.innovation,
             innovation_dof=2 * result.sightings,
@@ -367,8 +373,7 @@ class VehicleCore:
         if self.outbox.last < 0:
             raise ReadingRefused("the vehicle has not started: there is nothing to end")
         self.ended = True
-        part = FramePart(frame=0, status=FrameStatus.ENDED, delta=FrameDelta.nothing(), end_pose=self.filter.pose)
-        self._send(time_s=self.time_s, parts=(part,), end=True)
+        self._send(time_s=self.time_s, parts=self.filter.end(), end=True)
 
     def _send(self, **fields: object) -> None:
         identity = self.identity

@@ -11,13 +11,16 @@
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from fleet_seif.config import PublishSettings
 from fleet_seif.envelope import DELTA_MAX, body_digest
 from fleet_seif.information import FrameDelta, FrameTotal
-from fleet_seif.messages import DeltaMessage, FramePart, FrameStatus, Heartbeat, Hello, RangeRequest, Snapshot
+from fleet_seif.messages import DeltaMessage, FramePart, FrameStatus, Heartbeat, RangeRequest, Snapshot
+from fleet_seif.records import Floats
 from fleet_seif.signing import Signer
 from fleet_seif.store import Change, Delete, Put
 from fleet_seif.streams import EMPTY_PREFIX, Coalescer, extend_prefix, is_check_point
@@ -26,6 +29,8 @@ from vehicles import records
 from vehicles.records import EpochRecord, Trimmed
 
 ANSWER_BYTES_MAX = 4 * 2**20
+Published = tuple[FrameDelta, ...]
+"""All that has been published, frame by frame."""
 COALESCED_MAX = DELTA_MAX // 4
 """Bytes of a message above which it is not made larger."""
 
@@ -83,9 +88,11 @@ class Outbox:
         self._acked: dict[str, int] = {}
         self._trimmed: Trimmed | None = None
         self._trimmed_last = -1
+        self._ends: dict[int, Floats] = {}
 
-    def restore(self, trimmed: Trimmed | None, messages: Sequence[bytes]) -> None:
+    def restore(self, trimmed: Trimmed | None, ends: Mapping[int, Floats], messages: Sequence[bytes]) -> None:
         """Take what the store has kept; any of it may have been put, so all of it is fixed."""
+        self._ends = dict(ends)
         if trimmed is not None:
             newest = decode_message(trimmed.newest)
             self._trimmed, self._trimmed_last = trimmed, newest.last
@@ -225,6 +232,11 @@ class Outbox:
             innovation += gone.message.innovation
             dof += gone.message.innovation_dof
             refused += gone.message.refused
+            for part in gone.message.parts:
+                if part.end_pose is not None:
+                    self._ends[part.frame] = part.end_pose
+                    key = records.numbered(records.ENDS, self.ordinal, part.frame)
+                    self.changes.append(Put(key, np.asarray(part.end_pose, float).tobytes()))
         self._trimmed = Trimmed(
             newest=gone.data, prefix_digest=gone.prefix_digest,
             innovation=innovation, innovation_dof=dof, refused=refused,
@@ -248,16 +260,16 @@ class Outbox:
             ended=self.ended and self.last_put == self.last,
         )
 
-    def close(self, published: FrameDelta, signatures: Sequence[int]) -> None:
+    def close(self, published: Published, signatures: Sequence[int]) -> None:
         """This epoch takes no more: remember what the filter had published and named at its end."""
         self.record = dataclasses.replace(self.record, closed=published, closed_names=tuple(signatures))
         self.changes.append(Put(records.numbered(records.EPOCH, self.ordinal), self.record.pack()))
 
-    def snapshot(self, published: Callable[[], FrameDelta] | None, signatures: Sequence[int]) -> Snapshot | None:
+    def snapshot(self, published: Callable[[], Published] | None, signatures: Sequence[int]) -> Snapshot | None:
         """The forgotten prefix as one message; None where nothing has been forgotten yet, or nobody knows it any more.
 
-        published, signatures: all that the filter has published in frame 0 so far, and the names in it; a closed
-        epoch knows them itself.
+        published, signatures: all that the filter has published so far, and the names in it; a closed epoch knows them
+        itself.
         """
         record = self.record
         if record.closed is not None:
@@ -268,26 +280,42 @@ class Outbox:
             return None
         if self._trimmed is None:
             return None
-        total, known = FrameTotal(), len(signatures)
-        total.add(whole)
-        total.subtract(record.base)
+        totals, known = [FrameTotal() for _ in whole], len(signatures)
+        for total, delta in zip(totals, whole, strict=True):
+            total.add(delta)
+        for total, delta in zip(totals, record.base, strict=False):
+            total.subtract(delta)
         for message in [*(sent.message for sent in self._sent), *(waiting.message for waiting in self._unsent)]:
             known -= len(message.landmarks)
             for part in message.parts:
-                total.subtract(part.delta)
+                totals[part.frame].subtract(part.delta)
         newest = decode_message(self._trimmed.newest)
         named = tuple(enumerate(signatures))[record.names : known]
         hello = decode_message(record.hello).hello
-        assert hello is not None
         message = dataclasses.replace(
-            newest, first=0, hello=hello, parts=_parts(total.delta(), newest, hello), landmarks=named,
+            newest, first=0, hello=hello, parts=self._parts([total.delta() for total in totals]), landmarks=named,
             innovation=self._trimmed.innovation, innovation_dof=self._trimmed.innovation_dof,
             refused=self._trimmed.refused,
         )  # fmt: skip
         return Snapshot(message=message, prefix_digest=self._trimmed.prefix_digest)
 
+    def _parts(self, changes: Sequence[FrameDelta]) -> tuple[FramePart, ...]:
+        """What the prefix says of each frame: opened in it or before it, ended or corrected in it, or neither."""
+        parts, nothing = [], FrameDelta.nothing()
+        for frame, delta in enumerate(changes):
+            end = self._ends.get(frame)
+            status = FrameStatus.CONTINUED
+            if end is not None:
+                status = FrameStatus.CORRECTED if frame < self.record.ended else FrameStatus.ENDED
+            if frame >= len(self.record.base) and len(delta.variables):
+                parts.append(FramePart(frame=frame, status=FrameStatus.OPENED, delta=delta))
+                delta = nothing
+            if end is not None or (len(delta.variables) and status is FrameStatus.CONTINUED):
+                parts.append(FramePart(frame=frame, status=status, delta=delta, end_pose=end))
+        return tuple(parts)
+
     def answer(
-        self, request: RangeRequest, published: Callable[[], FrameDelta] | None, signatures: Sequence[int]
+        self, request: RangeRequest, published: Callable[[], Published] | None, signatures: Sequence[int]
     ) -> list[bytes]:
         """Messages of a range; where its start has been forgotten, a snapshot first."""
         found = []
@@ -302,19 +330,3 @@ class Outbox:
             if sent.message.last >= request.first and sent.message.first <= request.last:
                 found.append(sent.data)
         return found
-
-
-def _parts(delta: FrameDelta, newest: DeltaMessage, hello: Hello) -> tuple[FramePart, ...]:
-    """Frame 0 of a prefix: opened in it or before it, and ended where its newest message ended it."""
-    # the newest message may have been coalesced: then its own delta is in the total already
-    end_pose = newest.parts[-1].end_pose if newest.end else None
-    opened = hello.continues is None
-    if end_pose is None:
-        return (FramePart(frame=0, status=FrameStatus.OPENED if opened else FrameStatus.CONTINUED, delta=delta),)
-    if not opened:
-        return (FramePart(frame=0, status=FrameStatus.ENDED, delta=delta, end_pose=end_pose),)
-    nothing = FrameDelta.nothing()
-    return (
-        FramePart(frame=0, status=FrameStatus.OPENED, delta=delta),
-        FramePart(frame=0, status=FrameStatus.ENDED, delta=nothing, end_pose=end_pose),
-    )

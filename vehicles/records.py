@@ -1,6 +1,7 @@
 """Where things stand in a vehicle's store: keys, in order, and what their values are.
 
     c                    the largest counter that an epoch of this vehicle has had
+    d  ordinal frame     where a frame ends, as the acknowledged messages of an epoch say
     e  ordinal           an epoch: see `EpochRecord`
     f                    fleet, vehicle and filter settings
     m  ordinal first     a message that not every required node has acknowledged
@@ -27,6 +28,7 @@ from fleet_seif.records import Reading, Sightings
 KIND: Final = "outbox"
 SCHEMA: Final = 1
 COUNTER: Final = b"c"
+ENDS: Final = b"d"
 EPOCH: Final = b"e"
 IDENTITY: Final = b"f"
 MESSAGE: Final = b"m"
@@ -48,35 +50,39 @@ def after(table: bytes) -> bytes:
 class EpochRecord:
     """An epoch of this store.
 
-    hello: its first message, once there is one. base, names: what the filter had published and named before it.
-    closed, closed_names: the same after it; None while it is the newest.
+    hello: its first message, once there is one. base, names: what the filter had published, frame by frame, and named
+    before it; ended: how many of these frames had ended. closed, closed_names: the same after it; None while it is the
+    newest.
     """
 
     epoch: Epoch
     life: int
-    base: FrameDelta
+    base: tuple[FrameDelta, ...]
+    ended: int
     names: int
     hello: bytes = b""
-    closed: FrameDelta | None = None
+    closed: tuple[FrameDelta, ...] | None = None
     closed_names: tuple[int, ...] = ()
 
     def pack(self) -> bytes:
-        closed = None if self.closed is None else pack_delta(self.closed)
+        base = [pack_delta(delta) for delta in self.base]
+        closed = None if self.closed is None else [pack_delta(delta) for delta in self.closed]
         fields = (
-            tuple(self.epoch), self.life, pack_delta(self.base), self.names, self.hello, closed, self.closed_names
+            tuple(self.epoch), self.life, base, self.ended, self.names, self.hello, closed, self.closed_names
         )  # fmt: skip
         return bytes(msgpack.packb(fields))
 
     @staticmethod
     def read(data: bytes) -> "EpochRecord":
-        epoch, life, base, names, hello, closed, closed_names = msgpack.unpackb(data, use_list=False)
+        epoch, life, base, ended, names, hello, closed, closed_names = msgpack.unpackb(data, use_list=False)
         return EpochRecord(
             epoch=Epoch(*epoch),
             life=life,
-            base=read_delta(base),
+            base=tuple(read_delta(delta) for delta in base),
+            ended=ended,
             names=names,
             hello=hello,
-            closed=None if closed is None else read_delta(closed),
+            closed=None if closed is None else tuple(read_delta(delta) for delta in closed),
             closed_names=closed_names,
         )
 

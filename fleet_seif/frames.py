@@ -1,0 +1,312 @@
+"""A vehicle's filter cut into frames (DESIGN D5): each is a filter of its own, and is made anew when it closes.
+
+1. Frame f+1 starts at the last pose of frame f. What is sighted there belongs to the frame that closes.
+2. Landmarks are numbered over the whole life; within a frame the filter has its own numbers.
+3. A frame closes when its linearisation may soon be wrong (FilterSettings.frames). A batch over the readings of that
+   frame alone then replaces its posterior: the difference to what was published is a correction, published with the
+   message of the step `close_lag_steps` later, or with the end. Where the batch fails the filter's posterior stays.
+4. What is published is a function of this vehicle's own readings and settings, never of timing or of the joint map.
+5. With frames = "single" there is one, which closes at the end and is never corrected.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fleet_seif.config import FilterSettings
+from fleet_seif.delta_wire import pack_delta, read_delta
+from fleet_seif.errors import NumericalError
+from fleet_seif.filters import Names, StepResult
+from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
+from fleet_seif.frame_deltas import quantised, renumbered
+from fleet_seif.geometry import compose
+from fleet_seif.information import FrameDelta, FrameTotal
+from fleet_seif.joint import Life, landmark_names, solve
+from fleet_seif.messages import FramePart, FrameStatus
+from fleet_seif.models import RANGE_BEARING
+from fleet_seif.records import Floats, Ints, Reading, Sightings
+from fleet_seif.seif import Seif
+
+FRAME_LANDMARKS_MAX = 4096
+"""Landmarks of one frame of several, for which its filter reserves space."""
+
+
+@dataclass
+class FrameLog:
+    """The readings of one frame, and the live estimate after each: what its batch is made from."""
+
+    odometry: list[Floats] = field(default_factory=list)
+    odometry_cov: list[Floats] = field(default_factory=list)
+    poses: list[Floats] = field(default_factory=list)
+    sightings: list[tuple[int, Ints, Floats, Floats]] = field(default_factory=list)
+    heading_variance: float = 0.0
+
+    def add(self, reading: Reading | None, seen: Sightings, numbers: Ints, pose: Floats) -> None:
+        """One step: the motion (none before any), and what was seen, by the frame's own landmark numbers."""
+        if reading is not None:
+            self.odometry.append(np.array(reading.odometry, float))
+            self.odometry_cov.append(np.array(reading.odometry_cov, float))
+            self.poses.append(pose)
+            self.heading_variance += float(reading.odometry_cov[2, 2])
+        if len(numbers):
+            self.sightings.append((len(self.odometry), numbers, np.array(seen.z, float), np.array(seen.cov, float)))
+
+    def state(self) -> tuple[Any, ...]:
+        """Plain values for msgpack; `restored` takes them back."""
+        seen = [(step, numbers.tobytes(), z.tobytes(), Z.tobytes()) for step, numbers, z, Z in self.sightings]
+        motion = [np.array(each).tobytes() for each in (self.odometry, self.odometry_cov, self.poses)]
+        return (*motion, seen, self.heading_variance)
+
+    @staticmethod
+    def restored(state: tuple[Any, ...]) -> "FrameLog":
+        u, cov, poses, seen, heading_variance = state
+        return FrameLog(
+            odometry=list(np.frombuffer(u).reshape(-1, 3)),
+            odometry_cov=list(np.frombuffer(cov).reshape(-1, 3, 3)),
+            poses=list(np.frombuffer(poses).reshape(-1, 3)),
+            sightings=[
+                (
+                    step, np.frombuffer(numbers, np.int64), np.frombuffer(z).reshape(-1, 2),
+                    np.frombuffer(Z).reshape(-1, 2, 2),
+                )
+                for step, numbers, z, Z in seen
+            ],
+            heading_variance=heading_variance,
+        )  # fmt: skip
+
+    def solved(self, model: int, landmarks: Floats) -> FrameSolution:
+        """The batch over these readings, from the live estimates on. Raises NumericalError."""
+        steps = [np.full(len(numbers), step) for step, numbers, _, _ in self.sightings]
+        none = Sightings.none()
+        readings = FrameReadings(
+            model=model,
+            odometry=np.array(self.odometry).reshape(-1, 3),
+            odometry_cov=np.array(self.odometry_cov).reshape(-1, 3, 3),
+            step=np.concatenate([*steps, none.signature]).astype(np.int64),
+            landmark=np.concatenate([*(numbers for _, numbers, _, _ in self.sightings), none.signature]),
+            z=np.concatenate([*(z for _, _, z, _ in self.sightings), none.z]),
+            cov=np.concatenate([*(Z for _, _, _, Z in self.sightings), none.cov]),
+        )
+        return solve_frame(readings, np.array(self.poses).reshape(-1, 3), landmarks)
+
+
+@dataclass
+class Closed:
+    """A frame that has ended and is to be corrected at step `due`. landmarks: last live estimate; numbers: their names."""
+
+    frame: int
+    due: int
+    log: FrameLog
+    landmarks: Floats
+    numbers: Ints
+
+
+class FramedFilter:
+    """See the rules above."""
+
+    def __init__(self, settings: FilterSettings, model: int = RANGE_BEARING) -> None:
+        self.settings = settings
+        self.model = model
+        self.names = Names()
+        self.steps = 0
+        self.totals: list[FrameTotal] = []
+        self.ends: list[Floats] = []
+        self._single = settings.frames == "single"
+        self._frame_settings = settings
+        if not self._single:
+            most = min(settings.landmarks_max, FRAME_LANDMARKS_MAX)
+            self._frame_settings = settings.model_copy(update={"landmarks_max": most})
+        self._closed: list[Closed] = []
+        self._open()
+
+    def _open(self) -> None:
+        """Begin a frame; it is published with its first step."""
+        self.filter = Seif(self._frame_settings, self.model)
+        self._numbers: list[int] = []
+        self._log = FrameLog()
+        self._opened = False
+        self.totals.append(FrameTotal())
+
+    @property
+    def signatures(self) -> list[int]:
+        """Signatures of the life's landmarks by number."""
+        return self.names.signatures
+
+    @property
+    def pose(self) -> Floats:
+        """Live pose in the coordinates of frame 0, (x m, y m, theta rad), shape (3,)."""
+        pose = self.filter.pose
+        for end in reversed(self.ends):
+            pose = compose(end, pose)
+        return pose
+
+    @property
+    def landmarks(self) -> Floats:
+        """Live landmarks in the coordinates of frame 0, m, shape (n, 2), by number.
+
+        Of several frames, the solution of the joint system of all of them, so it takes as long as that.
+        """
+        if self._single:
+            return self.filter.landmarks
+        if not self.published():
+            return np.empty((0, 2))
+        life = Life(
+            vehicle="", life=0, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)), frames=self.published(),
+            signatures=tuple(self.signatures),
+        )  # fmt: skip
+        found = np.full((len(self.signatures), 2), np.nan)
+        solution = solve([life], tuple((name,) for name in landmark_names(life)))
+        found[[names[0].number for names in solution.classes]] = solution.landmark_mean
+        return found
+
+    @property
+    def frame(self) -> int:
+        """Number of the frame that the next step belongs to."""
+        return len(self.ends)
+
+    def start(self, sightings: Sightings) -> tuple[StepResult, tuple[FramePart, ...]]:
+        """What is seen before any motion: the first part of frame 0. Parts are what to publish."""
+        return self._take(None, sightings, self.filter.start(sightings))
+
+    def step(self, reading: Reading) -> tuple[StepResult, tuple[FramePart, ...]]:
+        """One reading. Raises what Seif.step raises; nothing has changed then."""
+        result = self.filter.step(reading)
+        self.steps += 1
+        return self._take(reading, reading.sightings, result)
+
+    def _take(
+        self, reading: Reading | None, seen: Sightings, result: StepResult
+    ) -> tuple[StepResult, tuple[FramePart, ...]]:
+        if self._single:
+            self.names.add(list(result.new))
+        else:
+            result = self._named(result)
+            self._log.add(reading, seen, self.filter.numbers_of(seen), self.filter.pose)
+        frame, status = self.frame, FrameStatus.CONTINUED if self._opened else FrameStatus.OPENED
+        self._opened = True
+        if self._single:
+            return result, (FramePart(frame=frame, status=status, delta=result.delta),)
+        self.totals[-1].add(result.delta)
+        if not self._is_over():
+            parts = [FramePart(frame=frame, status=status, delta=result.delta)]
+        elif status is FrameStatus.CONTINUED:
+            parts = [FramePart(frame=frame, status=FrameStatus.ENDED, delta=result.delta, end_pose=self._close())]
+        else:
+            nothing = FrameDelta.nothing()
+            parts = [
+                FramePart(frame=frame, status=status, delta=result.delta),
+                FramePart(frame=frame, status=FrameStatus.ENDED, delta=nothing, end_pose=self._close()),
+            ]
+        while self._closed and self._closed[0].due <= self.steps:
+            parts += self._correction(self._closed.pop(0))
+        return result, tuple(parts)
+
+    def _named(self, result: StepResult) -> StepResult:
+        """A step's result by the life's landmark numbers."""
+        first_new, new = len(self.names.signatures), []
+        for signature in result.new:
+            numbers, unknown = self.names.numbers(np.array([signature]))
+            new += unknown
+            self._numbers.append(int(numbers[0]))
+            self.names.add(unknown)
+        delta = renumbered(result.delta, np.array(self._numbers, np.int64))
+        return dataclasses.replace(result, delta=delta, first_new=first_new, new=tuple(new))
+
+    def _is_over(self) -> bool:
+        settings, log = self.settings, self._log
+        return (
+            len(log.odometry) >= settings.frame_steps_max
+            or len(self._numbers) >= settings.frame_landmarks_max
+            or log.heading_variance >= settings.frame_heading_std_max_rad**2
+        )
+
+    def _close(self) -> Floats:
+        """End the open frame where it is now, so that the next step begins another; its last pose."""
+        end_pose = self.filter.pose
+        due = self.steps + self.settings.close_lag_steps
+        self._closed.append(
+            Closed(self.frame, due, self._log, self.filter.landmarks, np.array(self._numbers, np.int64))
+        )
+        self.ends.append(end_pose)
+        self._open()
+        return end_pose
+
+    def _correction(self, closed: Closed) -> list[FramePart]:
+        """What the batch over a closed frame changes, to be published; nothing where it fails."""
+        total = self.totals[closed.frame]
+        try:
+            batch = closed.log.solved(self.model, closed.landmarks)
+            order = np.argsort(closed.numbers)
+            order = order[batch.seen[order]]
+            rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
+            variables = np.concatenate([[0], 1 + closed.numbers[order]]).astype(np.int64)
+            H, b, mean = batch.H[np.ix_(rows, rows)], batch.b[rows], batch.mean[rows]
+            change = FrameTotal()
+            change.add(quantised(variables, H, b, mean))
+            change.subtract(total.delta())
+        except NumericalError:
+            return []
+        delta = change.delta()
+        total.add(delta)
+        self.ends[closed.frame] = batch.mean[:3]
+        return [
+            FramePart(frame=closed.frame, status=FrameStatus.CORRECTED, delta=delta, end_pose=self.ends[closed.frame])
+        ]
+
+    def end(self) -> tuple[FramePart, ...]:
+        """Close the open frame and correct all that is outstanding."""
+        parts: list[FramePart] = []
+        if self._opened:
+            frame, nothing = self.frame, FrameDelta.nothing()
+            end_pose = self.filter.pose if self._single else self._close()
+            parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=nothing, end_pose=end_pose))
+        for closed in self._closed:
+            parts += self._correction(closed)
+        self._closed.clear()
+        return tuple(parts)
+
+    def state(self) -> dict[str, Any]:
+        """All that it knows, as plain values for msgpack; `restore` takes it back."""
+        state = {"filter": self.filter.state(), "steps": self.steps, "opened": self._opened}
+        if self._single:
+            return state
+        closed = [
+            (each.frame, each.due, each.log.state(), each.landmarks.tobytes(), each.numbers.tobytes())
+            for each in self._closed
+        ]
+        return {
+            **state, "numbers": self._numbers, "signatures": self.signatures, "log": self._log.state(),
+            "closed": closed, "totals": [pack_delta(total.delta()) for total in self.totals],
+            "ends": np.array(self.ends).tobytes(),
+        }  # fmt: skip
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on where `state` was taken, to the bit. Raises ValueError where it is not the state of a filter."""
+        self.filter.restore(state["filter"])
+        self.steps, self._opened = state["steps"], state["opened"]
+        self.names = Names()
+        if self._single:
+            self.names.add(self.filter.signatures)
+            return
+        self.names.add(list(state["signatures"]))
+        self._numbers, self._log = list(state["numbers"]), FrameLog.restored(state["log"])
+        self._closed = [
+            Closed(
+                frame, due, FrameLog.restored(log), np.frombuffer(landmarks).reshape(-1, 2),
+                np.frombuffer(numbers, np.int64),
+            )
+            for frame, due, log, landmarks, numbers in state["closed"]
+        ]  # fmt: skip
+        self.totals = [FrameTotal() for _ in state["totals"]]
+        for total, data in zip(self.totals, state["totals"], strict=True):
+            total.add(read_delta(data))
+        self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
+
+    def published(self) -> tuple[FrameDelta, ...]:
+        """The sum of all that has been published, frame by frame."""
+        if self._single:
+            return (self.filter.published(),) if self._opened else ()
+        return tuple(total.delta() for total in (self.totals if self._opened else self.totals[:-1]))
