@@ -623,7 +623,8 @@ def _in_company(chain: Chain, used: Bools) -> Bools:
     """`used` without sightings that are the last of several: of two that contradict each other neither is believed."""
     given, left = np.bincount(chain.landmark), np.bincount(chain.landmark[used], minlength=1)
     left = np.pad(left, (0, max(len(given) - len(left), 0)))
-    return used & ~((given > 1) & (left == 1))[chain.landmark]
+    company: Bools = used & ~((given > 1) & (left == 1))[chain.landmark]
+    return company
 
 
 def _seen(chain: Chain, used: Bools, landmarks: Floats) -> Bools:

@@ -10,7 +10,6 @@
 """
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -95,7 +94,7 @@ class FrameLog:
 
 @dataclass
 class Closed:
-    """A frame that has ended and is to be corrected at step `due`. landmarks: last live estimate; numbers: their names."""
+    """A frame that has ended and is to be corrected at step `due`. landmarks: as estimated last; numbers: names."""
 
     frame: int
     due: int

@@ -152,7 +152,7 @@ def squared_innovation(L: Floats, known: int, mu: Floats, model: int, z: Floats,
         s00 += v[i] * v[i]
         s10 += w[i] * v[i]
         s11 += w[i] * w[i]
-    return (r0 * r0 * s11 - 2.0 * r0 * r1 * s10 + r1 * r1 * s00) / (s00 * s11 - s10 * s10)
+    return float((r0 * r0 * s11 - 2.0 * r0 * r1 * s10 + r1 * r1 * s00) / (s00 * s11 - s10 * s10))
 
 
 @kernel
@@ -198,7 +198,10 @@ def weakest_links(strength: Floats, active_max: int) -> Ints:
     The weakest first, the lower number of two equal ones. strength (m,): see link_strengths.
     """
     left = strength.copy()
-    drop: Ints = np.empty(max(np.sum(left > 0.0) - active_max, 0), np.int64)
+    linked = 0
+    for i in range(len(left)):
+        linked += left[i] > 0.0
+    drop = np.empty(max(linked - active_max, 0), np.int64)
     for k in range(len(drop)):
         best = -1
         for i in range(len(left)):

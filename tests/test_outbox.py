@@ -18,8 +18,8 @@ from tests.drives import core_of, drive, put, square
 from tests.reference import same
 from tests.strategies import STEP_INFORMATION, STRONG, definite_deltas, pose_block, settled
 from vehicles.outbox import Outbox
-from vehicles.records import EPOCH as EPOCH_TABLE
 from vehicles.records import ENDS, MESSAGE, TRIMMED, EpochRecord, Trimmed, numbered
+from vehicles.records import EPOCH as EPOCH_TABLE
 
 EPOCH = Epoch(3, 4)
 WINDOW, OUTBOX_MAX = 5, 16
