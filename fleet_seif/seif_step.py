@@ -228,9 +228,14 @@ def relocate_into(
 ) -> bool:  # fmt: skip
     """ESEIF: forget where the pose is, and find it again from the sightings that were held back.
 
-    They are linearised where all the others have put it. False, leaving the block unusable, where H is not PD.
+    They are linearised at the mean of all that is known, before any of it is forgotten. False, leaving the block
+    unusable, where H is not PD.
     """
-    if not recover_mean_into(mu, H, b, pull):
+    H_all, b_all = H.copy(), b.copy()
+    for k in range(len(z)):
+        if held[k]:
+            measurement_update_into(H_all, b_all, mu, model, z[k], Z[k], at[k])
+    if not recover_mean_into(mu, H_all, b_all, pull):
         return False
     forget_pose_into(H, b, model)
     for k in range(len(z)):
