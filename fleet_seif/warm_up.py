@@ -4,6 +4,7 @@ import dataclasses
 import threading
 import time
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 
@@ -19,9 +20,12 @@ from fleet_seif.wire import decode_message, encode_message
 PATIENCE_S = 2.0
 
 
-def warm_up(say: Callable[[str], None] = lambda text: None) -> float:
+def warm_up(
+    say: Callable[[str], None] = lambda text: None, *, frames: Literal["single", "adaptive"] = "single"
+) -> float:
     """Run everything that is compiled once, on a toy. Returns the seconds it took.
 
+    frames: as in FilterSettings; "single" does without the batch that closes a frame.
     say: told where it takes longer than PATIENCE_S, which it does on the first run after an installation.
     """
     begin = time.perf_counter()
@@ -36,7 +40,7 @@ def warm_up(say: Callable[[str], None] = lambda text: None) -> float:
         signature=np.arange(3),
     )
     motion = Reading(time_s=1.0, odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=seen)
-    framed = FramedFilter(FilterSettings(active_max=1, frames="adaptive", frame_steps_max=1, close_lag_steps=1))
+    framed = FramedFilter(FilterSettings(active_max=1, frames=frames, frame_steps_max=1, close_lag_steps=1))
     backwards = dataclasses.replace(motion, sightings=dataclasses.replace(seen, signature=np.array([2, 1, 0])))
     total = FrameTotal()
     total.add(framed.start(seen)[0].delta)

@@ -283,7 +283,7 @@ def run_vehicle(
     acknowledgement."""
     sys.setswitchinterval(SWITCH_S)
     log = record(scenario, only=name).logs[name]
-    warm_up(lambda text: say({"event": "note", "text": text}))
+    warm_up(lambda text: say({"event": "note", "text": text}), frames=scenario.filter.frames)
     number = vehicle_names(scenario).index(name)
     fleet = scenario.fleet.name
     signer = place.signer(fleet, Role.VEHICLE, name)
