@@ -30,7 +30,7 @@ def warm_up(
     """
     begin = time.perf_counter()
     notice = threading.Timer(
-        PATIENCE_S, say, ["compiling numerical kernels (first run after an installation, about half a minute) ..."]
+        PATIENCE_S, say, ["compiling numerical kernels (first run after an installation, up to a minute) ..."]
     )
     notice.daemon = True
     notice.start()

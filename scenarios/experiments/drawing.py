@@ -109,4 +109,4 @@ Place = Literal["best", "upper left", "upper right", "lower left", "lower right"
 
 
 def legend(axes: Axes, place: Place = "best") -> None:
-    axes.legend(fontsize=SMALL, framealpha=0.9, edgecolor="none", loc=place, labelcolor=INK)
+    axes.legend(fontsize=SMALL, framealpha=0.6, edgecolor="none", loc=place, labelcolor=INK)

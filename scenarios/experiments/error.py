@@ -30,8 +30,8 @@ PAPER_M: Final = {"EKF": 0.053, "SEIF 6": 0.080, "SEIF 10": 0.058}
 PAPER_SIZE: Final = 50
 """Where the paper prints numbers; larger N are a curve."""
 EXACT: Final = seif(10, "SEIF 10 exact", mean="exact")
-EXACT_SIZE_MAX: Final = 300
-"""The exact mean takes a solution over the whole map a step: at N = 500 that is most of the experiment's time."""
+EXACT_SIZE_MAX: Final = 200
+"""The exact mean takes a solution over the whole map a step: beyond it most of the time would go there."""
 SEIFS: Final = (seif(6), seif(10))
 COLOURS: Final = {
     EKF.label: drawing.EKF_COLOUR,
