@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_seif.dense import cholesky_into, inverse_2x2, solve_lower_into, solve_upper_into
+from fleet_seif.dense import cholesky_into, solve_lower_into, solve_upper_into
 from fleet_seif.information import B_QUANTUM, H_QUANTUM, QUANTA_MAX
 from fleet_seif.jit import kernel
 from fleet_seif.local_updates import (
@@ -202,8 +202,10 @@ def relax(s: SeifArrays, y: int) -> tuple[float, float]:
             for c in range(3):
                 r0 -= s.H_xa[a, c, 0] * s.mu_x[c]
                 r1 -= s.H_xa[a, c, 1] * s.mu_x[c]
-    H_inv = inverse_2x2(s.H_yy[y])
-    new0, new1 = H_inv[0, 0] * r0 + H_inv[0, 1] * r1, H_inv[1, 0] * r0 + H_inv[1, 1] * r1
+    h00, h01, h10, h11 = s.H_yy[y, 0, 0], s.H_yy[y, 0, 1], s.H_yy[y, 1, 0], s.H_yy[y, 1, 1]
+    determinant = h00 * h11 - h01 * h10
+    new0 = h11 / determinant * r0 + -h01 / determinant * r1
+    new1 = -h10 / determinant * r0 + h00 / determinant * r1
     d0, d1 = new0 - s.mu_y[y, 0], new1 - s.mu_y[y, 1]
     s.mu_y[y, 0], s.mu_y[y, 1] = new0, new1
     return d0, d1
@@ -464,6 +466,11 @@ def published_total(s: SeifArrays) -> tuple[Ints, Ints, Ints, Ints, Ints]:
 def is_covariance(A: Floats) -> bool:
     """Symmetric to rounding, and positive definite."""
     n = len(A)
+    if n == 2:
+        if not abs(A[1, 0] - A[0, 1]) <= ASYMMETRY_MAX * math.sqrt(abs(A[0, 0] * A[1, 1])) or not A[0, 0] > 0.0:
+            return False
+        low = A[1, 0] / math.sqrt(A[0, 0])
+        return bool(A[1, 1] - low * low > 0.0)
     for i in range(n):
         for j in range(i):
             if not abs(A[i, j] - A[j, i]) <= ASYMMETRY_MAX * math.sqrt(abs(A[i, i] * A[j, j])):
@@ -474,8 +481,10 @@ def is_covariance(A: Floats) -> bool:
 @kernel
 def check_reading(model: int, u: Floats, cov: Floats, z: Floats, Z: Floats) -> int:
     """OK, or which rule a reading breaks: finite numbers, symmetric positive definite covariances, positive ranges."""
-    if not (np.all(np.isfinite(u)) and np.all(np.isfinite(cov)) and np.all(np.isfinite(z)) and np.all(np.isfinite(Z))):
-        return NOT_FINITE
+    for array in (u, cov.ravel(), z.ravel(), Z.ravel()):
+        for value in array:
+            if not math.isfinite(value):
+                return NOT_FINITE
     if not is_covariance(cov):
         return BAD_ODOMETRY_COV
     for k in range(len(z)):
