@@ -72,6 +72,7 @@ def test_a_real_run_gives_the_digest_of_the_virtual_one(finished: Path) -> None:
     assert report["digest"] == run_virtual("three_air_vehicles", FAST[1]).ledger.map_digest().hex()
 
 
+@pytest.mark.slow
 def test_a_lossy_real_run_gives_the_same_digest_too(finished: Path, tmp_path: Path) -> None:
     settings = [*FAST, "--set", "link.jitter_s=0.3"]
     done = command("run", "lossy_link", *settings, "--out", str(tmp_path), "--quiet")
