@@ -73,6 +73,8 @@ class Ends:
 
     def read(self, lines: Iterator[str]) -> None:
         for line in lines:
+            if not line.endswith("\n"):  # it was killed while it wrote this
+                return
             kind, _, time_s = line.partition(" ")
             self.heard.setdefault(kind, []).append(float(time_s))
 
