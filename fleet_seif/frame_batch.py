@@ -3,8 +3,8 @@
 1. Unknowns are the poses x_1 ... x_T and the landmarks the frame sighted; x_0 = (0, 0, 0) is given.
 2. Gauss-Newton, damped where a step does not help. Poses are eliminated along the chain, so what is left is already
    the exact marginal of the last pose and the landmarks: (H, b) of the frame.
-3. A sighting that contradicts the others is rejected and the frame solved again. A landmark left without a sighting
-   has rows of zeros: it is no landmark.
+3. A sighting that contradicts the others is rejected and the frame solved again. Of two that contradict each other
+   neither is believed. A landmark left without a sighting has rows of zeros: it is no landmark.
 4. Same input, same bits on the same kind of machine: loops only, no library of linear algebra.
 
 The algebra: between x_k and x_k+1 lies the residual e = x_k^-1 x_k+1 - u with covariance `cov`. Linearised,
@@ -18,7 +18,7 @@ dx_k+1 = F dx_k - s + noise of covariance U with s = G e, U = G cov G'. With the
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,16 +33,18 @@ from fleet_seif.records import Floats, Ints
 Bools = NDArray[np.bool_]
 
 GATE: Final = 30.0
-"""Squared normalised residual (chi-square, 2 degrees of freedom) beyond which a sighting is rejected."""
-HUBER: Final = 9.0
-"""Squared normalised residual beyond which a sighting pulls no harder in the first, rough solution."""
-ROUGH_STEP_MAX: Final = 1e-2
-ROUNDS_MAX: Final = 20
-"""Rejections one by one after that, and readmissions; a frame that needs more is returned as it is then."""
+"""Squared innovation (chi-square, 2 degrees of freedom), given all others, beyond which a sighting is rejected."""
 ITERATIONS_MAX: Final = 100
 """Linearisations of one solution."""
 STEP_MAX: Final = 1e-12
 """A solution is found where the next step would be shorter, in sigmas squared."""
+HUBER: Final = 9.0
+"""Squared normalised residual beyond which a sighting pulls no harder in a robust solution."""
+ROUGH_ITERATIONS_MAX: Final = 30
+ROUGH_STEP_MAX: Final = 1e-2
+"""A robust solution only has to tell outliers from the rest."""
+ROUNDS_MAX: Final = 20
+"""Solutions after that, each with a sighting less or some again; a frame that needs more is returned as it is then."""
 SLACK: Final = 1e-12
 """What the cost may grow by, relative: rounding."""
 DAMPING_FIRST: Final = 1e-6
@@ -83,12 +85,12 @@ class FrameReadings:
 class FrameSolution:
     """The posterior of a frame, linearised at its own mean. n = 3 + 2 L: last pose, then landmarks by number.
 
-    H (n, n), b = H mean (n,): zero in the rows of landmarks that are not `seen`.
+    H (n, n), b = H mean (n,): zero in the rows of landmarks that are not `seen`; positive definite in the others.
     mean (n,): the solution; the first guess where not `seen`. poses (T, 3): x_1 ... x_T.
     seen (L,): landmarks that kept a sighting. rejected (S,): sightings left out, in the order given.
-    chi_square: of all residuals that were used. dof: its degrees of freedom; 0 where nothing was seen twice.
-    worst: the largest squared normalised residual of a sighting that was used; above the gate only where
-    `rejections_max` was reached.
+    chi_square: of all residuals in use. dof: its degrees of freedom; 0 where nothing was seen twice.
+    worst: the largest squared innovation of a sighting in use, given the others; above the gate only where ROUNDS_MAX
+    was reached.
     iterations: linearisations in all.
     """
 
@@ -142,16 +144,19 @@ class Tape(NamedTuple):
 
 @kernel
 def as_points(r: Chain) -> Chain:
-    """Ranges and bearings as points, their noise to first order."""
-    z, Z, W, P = np.empty_like(r.z), np.empty_like(r.Z), np.empty_like(r.W), np.empty((2, 2))
+    """Ranges and bearings as points, their noise to first order.
+
+    Across, a point is known to the bearing's noise times the root of range^2 + its variance: a landmark measured on
+    top of the vehicle is not known to the width of a hair.
+    """
+    z, Z, W = np.empty_like(r.z), np.empty_like(r.Z), np.empty_like(r.W)
     for i in range(len(z)):
         c, s = math.cos(r.z[i, 1]), math.sin(r.z[i, 1])
+        d = math.sqrt(r.z[i, 0] * r.z[i, 0] + r.Z[i, 0, 0])
         z[i, 0], z[i, 1] = r.z[i, 0] * c, r.z[i, 0] * s
-        d = math.sqrt(
-            r.z[i, 0] ** 2 + r.Z[i, 0, 0]
-        )  # a landmark measured at the pose is not known across to the width of a hair
-        P[0, 0], P[0, 1], P[1, 0], P[1, 1] = c, -s * d, s, c * d
-        Z[i] = times(times(P, r.Z[i]), P.T)
+        a, b, q = r.Z[i, 0, 0], d * r.Z[i, 0, 1], d * d * r.Z[i, 1, 1]
+        Z[i, 0, 0], Z[i, 1, 1] = c * c * a - 2.0 * c * s * b + s * s * q, s * s * a + 2.0 * c * s * b + c * c * q
+        Z[i, 0, 1] = Z[i, 1, 0] = c * s * (a - q) + (c * c - s * s) * b
         W[i] = inverse_2x2(Z[i])
     return Chain(r.u, r.cov, r.M, r.first, r.landmark, z, Z, W)
 
@@ -189,29 +194,8 @@ def invert_noises_into(M: Floats, W: Floats, cov: Floats, Z: Floats) -> bool:
 
 
 @kernel
-def times(A: Floats, B: Floats) -> Floats:
-    """A B."""
-    C = np.zeros((A.shape[0], B.shape[1]))
-    for i in range(A.shape[0]):
-        for k in range(A.shape[1]):
-            for j in range(B.shape[1]):
-                C[i, j] += A[i, k] * B[k, j]
-    return C
-
-
-@kernel
-def applied(A: Floats, v: Floats) -> Floats:
-    """A v for the leading columns of A that v has rows."""
-    out = np.zeros(A.shape[0])
-    for i in range(A.shape[0]):
-        for j in range(len(v)):
-            out[i] += A[i, j] * v[j]
-    return out
-
-
-@kernel
 def squared_length(W: Floats, r: Floats) -> float:
-    """r' W r."""
+    """r' W r; what W has beyond is left alone."""
     total = 0.0
     for i in range(len(r)):
         for j in range(len(r)):
@@ -220,36 +204,45 @@ def squared_length(W: Floats, r: Floats) -> float:
 
 
 @kernel
-def motion_residual(model: int, x: Floats, x_next: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
-    """e = x^-1 x_next - u (3,), F^-1 (3, 3) and G (3, 3), where F = -J_e_next^-1 J_e_x and G = J_e_next^-1.
+def motion_residual(model: int, x: Floats, x_next: Floats, u: Floats) -> tuple[Floats, float, float, float, float]:
+    """e = x^-1 x_next - u (3,), headings not wrapped; and F = -J_e_next^-1 J_e_x, G = J_e_next^-1 as numbers.
 
-    Headings are not wrapped.
+    F^-1 is the identity but for f0, f1 above the 1 in its third column, G turns the first two axes by (c, s).
     """
-    F_inv, G = np.eye(3), np.eye(3)
-    if model != COMPASS_XY:
-        F_inv[0, 2], F_inv[1, 2] = x_next[1] - x[1], x[0] - x_next[0]
-        G[0, 0] = G[1, 1] = math.cos(x[2])
-        G[1, 0] = math.sin(x[2])
-        G[0, 1] = -G[1, 0]
-        return between(x, x_next) - u, F_inv, G
-    return x_next - x - u, F_inv, G
+    if model == COMPASS_XY:
+        return x_next - x - u, 0.0, 0.0, 1.0, 0.0
+    return between(x, x_next) - u, x_next[1] - x[1], x[0] - x_next[0], math.cos(x[2]), math.sin(x[2])
 
 
 @kernel
-def expect(
-    model: int, x: Floats, y: Floats
+def turned(c: float, s: float, M: Floats) -> Floats:
+    """G M G' for symmetric M (3, 3)."""
+    a, b, d = M[0, 0], M[0, 1], M[1, 1]
+    out = np.empty((3, 3))
+    out[0, 0], out[1, 1] = c * c * a - 2.0 * c * s * b + s * s * d, s * s * a + 2.0 * c * s * b + c * c * d
+    out[0, 1] = out[1, 0] = c * s * (a - d) + (c * c - s * s) * b
+    out[0, 2] = out[2, 0] = c * M[0, 2] - s * M[1, 2]
+    out[1, 2] = out[2, 1] = s * M[0, 2] + c * M[1, 2]
+    out[2, 2] = M[2, 2]
+    return out
+
+
+@kernel
+def look(
+    model: int, x: Floats, y: Floats, z: Floats
 ) -> tuple[float, float, float, float, float, float, float, float, float, float, float, float]:
-    """What pose x sees of landmark y, without arrays: h (2), then the rows of J_z_x and J_z_y, five numbers each."""
+    """A sighting from pose x, without arrays: r = z - h, bearings wrapped (2); rows of J_z_x and J_z_y, five each."""
     if model == POINT:
         c, s, dx, dy = math.cos(x[2]), math.sin(x[2]), y[0] - x[0], y[1] - x[1]
         ahead, left = c * dx + s * dy, -s * dx + c * dy
-        return ahead, left, -c, -s, left, c, s, s, -c, -ahead, -s, c
+        return z[0] - ahead, z[1] - left, -c, -s, left, c, s, s, -c, -ahead, -s, c
     h0, h1, x00, x01, y00, y01, x10, x11, y10, y11 = sight_numbers(model, x, y[0], y[1])
-    return h0, h1, x00, x01, 0.0, y00, y01, x10, x11, heading_column(model), y10, y11
+    r1 = wrap(z[1] - h1) if model == RANGE_BEARING else z[1] - h1
+    return z[0] - h0, r1, x00, x01, 0.0, y00, y01, x10, x11, heading_column(model), y10, y11
 
 
 @kernel
-def sighting_cost(r0: float, r1: float, W: Floats, bound: float) -> tuple[float, float]:
+def softened(r0: float, r1: float, W: Floats, bound: float) -> tuple[float, float]:
     """Huber's cost of a residual, and its weight: v = r' W r and 1 up to `bound`, beyond 2 sqrt(bound v) - bound."""
     v = r0 * r0 * W[0, 0] + 2.0 * r0 * r1 * W[0, 1] + r1 * r1 * W[1, 1]
     if v <= bound:
@@ -258,20 +251,12 @@ def sighting_cost(r0: float, r1: float, W: Floats, bound: float) -> tuple[float,
 
 
 @kernel
-def sighting_residual(model: int, x: Floats, y: Floats, z: Floats) -> tuple[float, float]:
-    """r = z - h with bearings wrapped: two numbers."""
-    h = expect(model, x, y)
-    return z[0] - h[0], wrap(z[1] - h[1]) if model == RANGE_BEARING else z[1] - h[1]
-
-
-@kernel
 def add_sighting_into(
     A: Floats, g: Floats, model: int, x: Floats, y: Floats, z: Floats, W: Floats, bound: float, at: int
 ) -> None:
     """A += w J' W J (lower half), g += w J' W r, w Huber's weight, on the pose's rows and the landmark's from `at`."""
-    _, _, a0, a1, a2, a3, a4, b0, b1, b2, b3, b4 = expect(model, x, y)
-    r0, r1 = sighting_residual(model, x, y, z)
-    _, weight = sighting_cost(r0, r1, W, bound)
+    r0, r1, a0, a1, a2, a3, a4, b0, b1, b2, b3, b4 = look(model, x, y, z)
+    _, weight = softened(r0, r1, W, bound)
     rows, J0, J1 = (0, 1, 2, at, at + 1), (a0, a1, a2, a3, a4), (b0, b1, b2, b3, b4)
     for i in range(5):
         w0 = weight * (J0[i] * W[0, 0] + J1[i] * W[1, 0])
@@ -282,50 +267,73 @@ def add_sighting_into(
 
 
 @kernel
-def leave_start_into(A: Floats, g: Floats, n: int, e: Floats, G: Floats, M: Floats) -> None:
+def leave_start_into(A: Floats, g: Floats, n: int, e: Floats, c: float, s: float, M: Floats) -> None:
     """From the given pose 0 to pose 1: dx_1 = -G e + noise. What pose 0 saw stays with the landmarks."""
-    G_M_G = times(times(G, M), G.T)
-    wish = applied(G_M_G, applied(G, e))
+    G_M_G = turned(c, s, M)
+    shift = (c * e[0] - s * e[1], s * e[0] + c * e[1], e[2])
     for a in range(3):
-        g[a] = -wish[a]
+        g[a] = -(G_M_G[a, 0] * shift[0] + G_M_G[a, 1] * shift[1] + G_M_G[a, 2] * shift[2])
         for i in range(n):
             A[i, a] = G_M_G[i, a] if i < 3 else 0.0
 
 
 @kernel
-def leave_pose_into(tape: Tape, k: int, n: int, e: Floats, F_inv: Floats, G: Floats, cov: Floats, M: Floats) -> float:
+def leave_pose_into(
+    tape: Tape, k: int, n: int, e: Floats, f0: float, f1: float, c: float, s: float, cov: Floats, M: Floats
+) -> float:
     """Eliminate pose k in favour of pose k + 1: the equations above, in place on the first n rows.
 
     Returns c' V^-1 c: what pose k itself would gain by a step, in sigmas squared.
     """
-    A, g = tape.A, tape.g
-    A_x, pick = np.empty((3, n)), np.eye(3, n)
+    A, g, B, V = tape.A, tape.g, tape.B[k], tape.V[k]
+    W, KW, q, f = np.empty((3, n)), np.empty((3, n)), np.empty(3), np.empty(3)
+    shift = (c * e[0] - s * e[1], s * e[0] + c * e[1], e[2])
     for i in range(n):
         for a in range(3):
-            A_x[a, i] = A[max(a, i), min(a, i)]
-    W = times(F_inv.T, A_x)
-    W[:, :3] = times(W[:, :3], F_inv)
-    q, s = applied(F_inv.T, g[:3]), applied(G, e)
-    U = times(times(G, cov), G.T)
-    K = solve_3x3(np.eye(3) + times(U, W[:, :3]), U)
-    K = 0.5 * (K + K.T)
-    KW, Kq = times(K, W), applied(K, q)
-    g[:3] = q
+            W[a, i] = A[max(a, i), min(a, i)]
+        W[2, i] += f0 * W[0, i] + f1 * W[1, i]
+    for a in range(3):
+        W[a, 2] += f0 * W[a, 0] + f1 * W[a, 1]
+        q[a] = g[a]
+    q[2] += f0 * g[0] + f1 * g[1]
+    U, I_UW = turned(c, s, cov), np.empty((3, 3))
+    for a in range(3):
+        for i in range(3):
+            I_UW[a, i] = U[a, 0] * W[0, i] + U[a, 1] * W[1, i] + U[a, 2] * W[2, i]
+        I_UW[a, a] += 1.0
+    K = solve_3x3(I_UW, U)
+    for a in range(3):
+        for i in range(a):
+            K[a, i] = K[i, a] = 0.5 * (K[a, i] + K[i, a])
+    for a in range(3):
+        for i in range(n):
+            KW[a, i] = K[a, 0] * W[0, i] + K[a, 1] * W[1, i] + K[a, 2] * W[2, i]
+        f[a] = shift[a] + K[a, 0] * q[0] + K[a, 1] * q[1] + K[a, 2] * q[2]
+        f[a] -= KW[a, 0] * shift[0] + KW[a, 1] * shift[1] + KW[a, 2] * shift[2]
+        g[a] = q[a]
     for i in range(n):
-        g[i] -= W[0, i] * Kq[0] + W[1, i] * Kq[1] + W[2, i] * Kq[2]
+        w0, w1, w2 = W[0, i], W[1, i], W[2, i]
+        g[i] -= KW[0, i] * q[0] + KW[1, i] * q[1] + KW[2, i] * q[2]
         for a in range(min(i + 1, 3)):
             A[i, a] = W[a, i]
         for j in range(i + 1):
-            A[i, j] -= W[0, i] * KW[0, j] + W[1, i] * KW[1, j] + W[2, i] * KW[2, j]
+            A[i, j] -= w0 * KW[0, j] + w1 * KW[1, j] + w2 * KW[2, j]
     for i in range(n):
         for a in range(3):
-            g[i] -= A[max(a, i), min(a, i)] * s[a]
-    f = s - applied(KW, s) + Kq
+            g[i] -= A[max(a, i), min(a, i)] * shift[a]
+    for i in range(n):
+        low = (1.0 if i == 2 else 0.0) - KW[2, i]
+        B[0, i] = (1.0 if i == 0 else 0.0) - KW[0, i] + f0 * low
+        B[1, i] = (1.0 if i == 1 else 0.0) - KW[1, i] + f1 * low
+        B[2, i] = low
+    tape.c[k, 0], tape.c[k, 1], tape.c[k, 2] = f[0] + f0 * f[2], f[1] + f1 * f[2], f[2]
+    for a in range(3):
+        V[a, 0], V[a, 1], V[a, 2] = K[a, 0] + f0 * K[a, 2], K[a, 1] + f1 * K[a, 2], K[a, 2]
+    for a in range(3):
+        V[0, a] += f0 * V[2, a]
+        V[1, a] += f1 * V[2, a]
     tape.width[k] = n
-    tape.B[k, :, :n] = times(F_inv, pick - KW)
-    tape.c[k] = applied(F_inv, f)
-    tape.V[k] = times(times(F_inv, K), F_inv.T)
-    return squared_length(W[:, :3], f) + squared_length(M, applied(G.T, f))
+    return squared_length(W, f) + squared_length(turned(c, s, M), f)
 
 
 @kernel
@@ -342,11 +350,11 @@ def eliminate_into(
     n, length = 3, 0.0
     for k in range(T + 1):
         if k > 0:
-            e, F_inv, G = motion_residual(model, x[k - 1], x[k], r.u[k - 1])
+            e, f0, f1, c, s = motion_residual(model, x[k - 1], x[k], r.u[k - 1])
             if k == 1:
-                leave_start_into(A, g, n, e, G, r.M[0])
+                leave_start_into(A, g, n, e, c, s, r.M[0])
             else:
-                length += leave_pose_into(tape, k - 1, n, e, F_inv, G, r.cov[k - 1], r.M[k - 1])
+                length += leave_pose_into(tape, k - 1, n, e, f0, f1, c, s, r.cov[k - 1], r.M[k - 1])
         for i in range(r.first[k], r.first[k + 1]):
             j = r.landmark[i]
             n = max(n, 5 + 2 * j)
@@ -386,8 +394,12 @@ def take_step_into(
     T, d, dx = len(x) - 1, tape.g.copy(), np.zeros_like(x)
     dx[T] = d[:3]
     for k in range(T - 1, 0, -1):
-        d[:3] = applied(tape.B[k], d[: tape.width[k]]) + tape.c[k]
-        dx[k] = d[:3]
+        for a in range(3):
+            dx[k, a] = tape.c[k, a]
+            for i in range(tape.width[k]):
+                dx[k, a] += tape.B[k, a, i] * d[i]
+        for a in range(3):
+            d[a] = dx[k, a]
     new_x[:] = x + dx
     for j in range(len(y)):
         new_y[j, 0], new_y[j, 1] = y[j, 0] + d[3 + 2 * j], y[j, 1] + d[4 + 2 * j]
@@ -412,27 +424,30 @@ def cost(model: int, r: Chain, used: Bools, bound: float, x: Floats, y: Floats) 
     total = 0.0
     for k in range(len(x)):
         if k > 0:
-            e, _, _ = motion_residual(model, x[k - 1], x[k], r.u[k - 1])
+            e = motion_residual(model, x[k - 1], x[k], r.u[k - 1])[0]
             total += squared_length(r.M[k - 1], e)
         for i in range(r.first[k], r.first[k + 1]):
             if used[i]:
-                r0, r1 = sighting_residual(model, x[k], y[r.landmark[i]], r.z[i])
-                total += sighting_cost(r0, r1, r.W[i], bound)[0]
+                seen = look(model, x[k], y[r.landmark[i]], r.z[i])
+                total += softened(seen[0], seen[1], r.W[i], bound)[0]
     return total
 
 
 @kernel
 def optimise_into(
-    x: Floats, y: Floats, tape: Tape, model: int, r: Chain, used: Bools, bound: float, step_max: float
+    x: Floats, y: Floats, tape: Tape, model: int, r: Chain, used: Bools, bound: float, most: int
 ) -> tuple[int, int, float]:
-    """Gauss-Newton from x, y until it stands still, damped where a step raises the cost.
+    """Gauss-Newton from x, y until it stands still, damped where a step raises the cost; `most` linearisations.
+
+    bound: of Huber's cost; infinite for least squares, else a rough solution will do.
 
     Leaves in x, y the solution, in the tape the linearisation there, undamped. Returns OK or what went wrong, the
     linearisations it took, and chi-square.
     """
     new_x, new_y = x.copy(), y.copy()
     now, damping = cost(model, r, used, bound, x, y), 0.0
-    for iteration in range(1, ITERATIONS_MAX + 1):
+    step_max = STEP_MAX if bound == np.inf else ROUGH_STEP_MAX
+    for iteration in range(1, most + 1):
         length = eliminate_into(tape, model, r, used, bound, x, y, damping)
         if not length >= 0.0:
             return NOT_POSITIVE, iteration, now
@@ -445,7 +460,8 @@ def optimise_into(
             damping = damping / DAMPING_FACTOR if damping > DAMPING_FIRST else 0.0
         else:
             damping = max(DAMPING_FIRST, damping * DAMPING_FACTOR)
-    return NOT_CONVERGED, ITERATIONS_MAX, now
+    found = eliminate_into(tape, model, r, used, bound, x, y, 0.0) >= 0.0
+    return NOT_CONVERGED if found else NOT_POSITIVE, most + 1, now
 
 
 @kernel
@@ -460,10 +476,10 @@ def inverse_of(L: Floats) -> Floats:
 
 
 @kernel
-def residual_test(
-    S: Floats, model: int, x: Floats, y: Floats, r0: float, r1: float, Z: Floats, weight: float, at: int
+def squared_innovation(
+    S: Floats, model: int, x: Floats, y: Floats, z: Floats, Z: Floats, W: Floats, used: bool, bound: float, at: int
 ) -> float:
-    """The squared innovation of a sighting, given all others: r is its residual, P = J S J', w its weight in S.
+    """The squared innovation of a sighting, given all others: r its residual, P = J S J', w its weight in S.
 
         r' (Z - w P)^-1 Z (Z + (1 - w) P)^-1 r
 
@@ -471,7 +487,8 @@ def residual_test(
     a linear world. 0 where nothing else measures what the sighting does.
     S (n, n): posterior covariance of the pose and the landmarks.
     """
-    _, _, a0, a1, a2, a3, a4, b0, b1, b2, b3, b4 = expect(model, x, y)
+    r0, r1, a0, a1, a2, a3, a4, b0, b1, b2, b3, b4 = look(model, x, y, z)
+    weight = softened(r0, r1, W, bound)[1] if used else 0.0
     rows, J0, J1 = (0, 1, 2, at, at + 1), (a0, a1, a2, a3, a4), (b0, b1, b2, b3, b4)
     p00, p01, p11 = 0.0, 0.0, 0.0
     for i in range(5):
@@ -494,10 +511,27 @@ def residual_test(
 
 
 @kernel
-def test_residuals(
+def back_into(S: Floats, B: Floats, V: Floats, n: int) -> None:
+    """From the covariance of pose k + 1 and the first landmarks, n rows, to that of pose k: B S, B S B' + V."""
+    BS = np.zeros((3, n))
+    for a in range(3):
+        for i in range(n):
+            for j in range(n):
+                BS[a, j] += B[a, i] * S[i, j]
+    for a in range(3):
+        for c in range(3):
+            S[a, c] = V[a, c]
+            for i in range(n):
+                S[a, c] += BS[a, i] * B[c, i]
+        for i in range(3, n):
+            S[a, i] = S[i, a] = BS[a, i]
+
+
+@kernel
+def squared_innovations(
     tape: Tape, model: int, r: Chain, used: Bools, seen: Bools, bound: float, x: Floats, y: Floats
 ) -> Floats:
-    """`residual_test` of every sighting, (S,); infinite for one of a landmark that is not `seen`.
+    """`squared_innovation` of every sighting, (S,); infinite for one of a landmark that is not `seen`.
 
     Covariances run backwards: S_k: = B S_k+1:, S_kk = B S_k+1 B' + V.
     """
@@ -506,53 +540,42 @@ def test_residuals(
         if k == 0:
             S[:3], S[:, :3] = 0.0, 0.0
         elif k < T:
-            n = tape.width[k]
-            B, S_k = tape.B[k], np.zeros((3, n))
-            for a in range(3):
-                for i in range(n):
-                    for j in range(n):
-                        S_k[a, j] += B[a, i] * S[i, j]
-            S_kk = tape.V[k] + times(S_k, B[:, :n].T)
-            S[:3, :n], S[:n, :3] = S_k, S_k.T
-            S[:3, :3] = S_kk
+            back_into(S, tape.B[k], tape.V[k], tape.width[k])
         for i in range(r.first[k], r.first[k + 1]):
             j = r.landmark[i]
             if not seen[j]:
                 value[i] = np.inf
                 continue
-            r0, r1 = sighting_residual(model, x[k], y[j], r.z[i])
-            weight = sighting_cost(r0, r1, r.W[i], bound)[1] if used[i] else 0.0
-            value[i] = residual_test(S, model, x[k], y[j], r0, r1, r.Z[i], weight, 3 + 2 * j)
+            value[i] = squared_innovation(S, model, x[k], y[j], r.z[i], r.Z[i], r.W[i], used[i], bound, 3 + 2 * j)
     return value
 
 
 @kernel
 def marginal(tape: Tape, x: Floats, y: Floats, seen: Bools) -> tuple[Floats, Floats, Floats]:
-    """H, b = H mean and mean of the last pose and the landmarks; rows of landmarks not seen are zero."""
+    """H, b = H mean and mean of the last pose and the landmarks, the step included; rows of those not seen are zero."""
     n = len(tape.g)
-    H, mean = tape.A.copy(), np.empty(n)
-    mean[:3] = x[len(x) - 1]
+    H, mean = tape.A.copy(), tape.g.copy()
+    mean[:3] += x[len(x) - 1]
     for j in range(len(y)):
-        mean[3 + 2 * j], mean[4 + 2 * j] = y[j, 0], y[j, 1]
+        mean[3 + 2 * j] += y[j, 0]
+        mean[4 + 2 * j] += y[j, 1]
         if not seen[j]:
             H[3 + 2 * j, 3 + 2 * j] = H[4 + 2 * j, 4 + 2 * j] = 0.0
     for i in range(n):
         for j in range(i):
             H[j, i] = H[i, j]
-    return H, applied(H, mean), mean
+    b = np.zeros(n)
+    for i in range(n):
+        for j in range(n):
+            b[i] += H[i, j] * mean[j]
+    return H, b, mean
 
 
-def solve_frame(
-    readings: FrameReadings,
-    poses: Floats,
-    landmarks: Floats,
-    *,
-    gate: float = GATE,
-) -> FrameSolution:
-    """The posterior of a frame from its own readings, outliers left out.
+def solve_frame(readings: FrameReadings, poses: Floats, landmarks: Floats, *, gate: float = GATE) -> FrameSolution:
+    """The posterior of a frame from its own readings, without the sightings that contradict the others.
 
-    Round by round the sighting with the largest squared normalised residual beyond `gate` is rejected. Where that
-    leaves its landmark a single sighting, that one goes too: of two that contradict each other neither is believed.
+    A sighting is tested by its innovation, given all others. Where all pass, that is all. Else a robust solution finds
+    those to leave out; then the worst one beyond `gate` goes, round by round, and what passes after all comes back.
 
     Args:
         poses, landmarks: the first guess, (T, 3) and (L, 2), say of the live filter. A landmark without a sighting is
@@ -564,72 +587,107 @@ def solve_frame(
             caller keeps the posterior it has.
     """
     chain, order = _checked(readings, poses, landmarks)
-    x, y = np.vstack([np.zeros((1, 3)), poses]), np.array(landmarks, np.float64).reshape(-1, 2)
-    tape = _tape(len(x) - 1, len(y))
-    used, iterations = _plausible(x, y, tape, readings.model, chain, gate)
-    back = np.zeros_like(used)
-    for again in range(ROUNDS_MAX, -1, -1):
-        code, count, chi_square = optimise_into(x, y, tape, readings.model, chain, used, math.inf, STEP_MAX)
-        iterations += count
-        if code != OK:
-            _give_up(code, iterations)
-        seen = _seen(chain, used, y)
-        value = test_residuals(tape, readings.model, chain, used, seen, math.inf, x, y)
-        worst = float(np.max(value[used], initial=0.0))
-        fits = ~used & ~back & (value <= gate)
-        if not again or (worst <= gate and not np.any(fits)):
-            break
-        if worst > gate:
-            gone = np.argmax(np.where(used, value, -1.0))
-            used[gone] = False
-            used = _in_company(chain, used)
-        else:
-            used |= fits
-            back |= fits
-    H, b, mean = marginal(tape, x, y, seen)
-    was_rejected = np.empty(len(order), np.bool_)
-    was_rejected[order] = ~used
+    state = _Estimate(readings.model, chain, poses, landmarks)
+    code = state.solve(ROUGH_ITERATIONS_MAX)
+    if code != OK or state.worst() > gate:
+        state = _robust(state, poses, landmarks, gate)
+        for again in range(ROUNDS_MAX):
+            code = state.solve(ITERATIONS_MAX)
+            if code != OK:
+                _give_up(code, state.iterations)
+            if again == ROUNDS_MAX - 1 or not state.reconsider(gate):
+                break
+    return _solution(state, order)
+
+
+def _solution(state: "_Estimate", order: Ints) -> FrameSolution:
+    H, b, mean = marginal(state.tape, state.x, state.y, state.seen())
+    rejected = np.empty(len(order), np.bool_)
+    rejected[order] = ~state.used
     return FrameSolution(
-        H=H, b=b, mean=mean, poses=x[1:], seen=seen, rejected=was_rejected, chi_square=chi_square,
-        dof=2 * int(np.count_nonzero(used) - np.count_nonzero(seen)),
-        worst=worst, iterations=iterations,
+        H=H, b=b, mean=mean, poses=state.x[1:], seen=state.seen(), rejected=rejected, chi_square=state.cost,
+        dof=2 * int(np.count_nonzero(state.used) - np.count_nonzero(state.seen())),
+        worst=state.worst(), iterations=state.iterations,
     )  # fmt: skip
 
 
-def _plausible(x: Floats, y: Floats, tape: Tape, model: int, chain: Chain, gate: float) -> tuple[Bools, int]:
-    """Sightings that agree with the others, (S,), and linearisations made. Leaves a rough, robust solution in x, y.
+class _Estimate:
+    """Where a solution stands: poses x (T+1, 3), landmarks y (L, 2), sightings used (S,)."""
 
-    A guess may be spoilt by the very outliers. So where it leads to any, the solution from odometry alone competes.
+    def __init__(self, model: int, chain: Chain, poses: Floats, landmarks: Floats) -> None:
+        T, n = len(poses), 3 + 2 * len(landmarks)
+        self.model, self.chain = model, chain
+        self.x, self.y = np.vstack([np.zeros((1, 3)), poses]), np.array(landmarks, np.float64, order="C")
+        self.tape = Tape(
+            A=np.empty((n, n)), g=np.empty(n), L=np.zeros((n, n)),
+            B=np.empty((T, 3, n)), c=np.empty((T, 3)), V=np.empty((T, 3, 3)), width=np.zeros(T, np.int64),
+        )  # fmt: skip
+        self.used = np.ones(len(chain.z), np.bool_)
+        self.innovation = np.zeros(len(chain.z))  # squared, of each sighting given the others
+        self.cost = 0.0
+        self.iterations = 0
+        self._returned = np.zeros(len(chain.z), np.bool_)
+
+    def solve(self, most: int, bound: float = math.inf) -> int:
+        """Solve with what is in use, then test all sightings. Returns OK, or what went wrong."""
+        fixed = self.tape, self.model, self.chain, self.used
+        code, count, self.cost = optimise_into(self.x, self.y, *fixed, bound, most)
+        self.iterations += count
+        if code != NOT_POSITIVE:
+            self.innovation = squared_innovations(*fixed, self.seen(), bound, self.x, self.y)
+        return code
+
+    def seen(self) -> Bools:
+        """Landmarks with a sighting in use, (L,)."""
+        return np.bincount(self.chain.landmark[self.used], minlength=len(self.y)) > 0
+
+    def worst(self) -> float:
+        """The largest squared innovation of a sighting in use."""
+        return float(np.max(self.innovation[self.used], initial=0.0))
+
+    def keep(self, those: Bools) -> None:
+        """Use those sightings, but none that is the last of several: of two that disagree neither is believed."""
+        given = np.bincount(self.chain.landmark, minlength=len(self.y))
+        left = np.bincount(self.chain.landmark[those], minlength=len(self.y))
+        self.used = those & ~((given > 1) & (left == 1))[self.chain.landmark]
+
+    def reconsider(self, gate: float) -> bool:
+        """Give up the worst sighting, or take back, once, what passes. False where there is nothing to change."""
+        passes = ~self.used & ~self._returned & (self.innovation <= gate)
+        if self.worst() > gate:
+            self.keep(self.used & (self.innovation < self.worst()))
+            return True
+        self._returned |= passes
+        self.keep(self.used | passes)
+        return bool(np.any(passes))
+
+
+def _robust(plain: _Estimate, poses: Floats, landmarks: Floats, gate: float) -> _Estimate:
+    """A rough solution in which no sighting pulls hard, with those in use that pass the test there.
+
+    Ranges and bearings count as points first, so that no outlier drags a landmark across a pose, where bearings turn
+    over. A guess may be spoilt by the very outliers, so that the solution from odometry alone competes with it.
     """
+    model, chain = plain.model, plain.chain
     sight, points = (POINT, as_points(chain)) if model == RANGE_BEARING else (model, chain)
-    everything = np.ones(len(chain.z), np.bool_)
-    used, iterations, least = everything, 0, math.inf
-    for new_x, new_y in ((x.copy(), y.copy()), reckoned(model, chain, y.copy())):
-        code, count, total = optimise_into(new_x, new_y, tape, sight, points, everything, HUBER, ROUGH_STEP_MAX)
-        iterations += count
-        if code != NOT_POSITIVE and total < least:
-            x[:], y[:], least = new_x, new_y, total
-            used = test_residuals(tape, sight, points, everything, _seen(chain, everything, y), HUBER, x, y) <= gate
-        if np.all(used) and least < math.inf:
-            break
+    x, y = reckoned(model, chain, landmarks)
+    starts = [_Estimate(sight, points, poses, landmarks), _Estimate(sight, points, x[1:], y)]
+    codes = [start.solve(ROUGH_ITERATIONS_MAX, HUBER) for start in starts]
+    best = min(
+        (start for start, code in zip(starts, codes) if code != NOT_POSITIVE),
+        key=lambda start: start.cost,
+        default=None,
+    )
+    iterations = plain.iterations + sum(start.iterations for start in starts)
+    if best is None:
+        _give_up(NOT_POSITIVE, iterations)
+    best.iterations = iterations
+    best.keep(best.innovation <= gate)
     if model == RANGE_BEARING:
-        code, count, total = optimise_into(x, y, tape, model, chain, used, HUBER, ROUGH_STEP_MAX)
-        iterations += count
-        used = test_residuals(tape, model, chain, used, _seen(chain, used, y), HUBER, x, y) <= gate
-    return _in_company(chain, used), iterations
-
-
-def _in_company(chain: Chain, used: Bools) -> Bools:
-    """`used` without sightings that are the last of several: of two that contradict each other neither is believed."""
-    given, left = np.bincount(chain.landmark), np.bincount(chain.landmark[used], minlength=1)
-    left = np.pad(left, (0, max(len(given) - len(left), 0)))
-    company: Bools = used & ~((given > 1) & (left == 1))[chain.landmark]
-    return company
-
-
-def _seen(chain: Chain, used: Bools, landmarks: Floats) -> Bools:
-    """Landmarks with a sighting in use, (L,)."""
-    return np.bincount(chain.landmark[used], minlength=len(landmarks)) > 0
+        best.model, best.chain = model, chain
+        best.solve(ROUGH_ITERATIONS_MAX, HUBER)
+        best.keep(best.innovation <= gate)
+    return best
 
 
 def _checked(readings: FrameReadings, poses: Floats, landmarks: Floats) -> tuple[Chain, Ints]:
@@ -661,15 +719,7 @@ def _checked(readings: FrameReadings, poses: Floats, landmarks: Floats) -> tuple
     return Chain(u, cov, M, first, landmark[order], z, Z, W), order
 
 
-def _tape(T: int, L: int) -> Tape:
-    n = 3 + 2 * L
-    return Tape(
-        A=np.empty((n, n)), g=np.empty(n), L=np.zeros((n, n)),
-        B=np.empty((T, 3, n)), c=np.empty((T, 3)), V=np.empty((T, 3, 3)), width=np.zeros(T, np.int64),
-    )  # fmt: skip
-
-
-def _give_up(code: int, iterations: int) -> None:
+def _give_up(code: int, iterations: int) -> NoReturn:
     if code == NOT_POSITIVE:
         raise NumericalError(
             f"frame not solved: its information matrix is not positive definite or not finite in linearisation"
