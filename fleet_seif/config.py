@@ -62,11 +62,13 @@ class FilterSettings(Settings):
 class PublishSettings(Settings):
     """How a vehicle publishes.
 
+    every_steps: steps that one message covers; less where a frame ends. More steps are fewer bytes and an older map.
     window: messages that may be put past the last acknowledgement.
     outbox_max: messages kept until acknowledged; beyond it the unsent ones are coalesced.
     heartbeat_s: time between heartbeats. nodes_max: fusion nodes whose acknowledgements are kept track of.
     """
 
+    every_steps: Annotated[int, Field(ge=1, le=10_000)] = 1
     window: Annotated[int, Field(ge=1, le=100_000)] = 256
     outbox_max: Annotated[int, Field(ge=16, le=1_000_000)] = 20_000
     heartbeat_s: Positive = 0.25

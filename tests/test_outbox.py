@@ -37,12 +37,13 @@ def record() -> EpochRecord:
 class OutboxMachine(RuleBasedStateMachine):
     """An outbox with its store, beside a list of everything that was appended, put and acknowledged."""
 
+    settings = SETTINGS
     required: tuple[str, ...] = ()
     nodes: tuple[str, ...] = ("a", "b")
 
     def __init__(self) -> None:
         super().__init__()
-        self.outbox = Outbox(SETTINGS, record(), required=self.required)
+        self.outbox = Outbox(self.settings, record(), required=self.required)
         self.store = MemoryStore()
         self.pending: tuple[list[Change], int] | None = None
         self.total = FrameTotal()
@@ -149,7 +150,8 @@ class OutboxMachine(RuleBasedStateMachine):
         """A crash: what was not committed is gone. The next process goes on in another epoch, and closes this one."""
         kept = dict(self.store.load())
         stored = kept.get(numbered(EPOCH_TABLE, 0))
-        self.outbox = Outbox(SETTINGS, record() if stored is None else EpochRecord.read(stored), required=self.required)
+        known = record() if stored is None else EpochRecord.read(stored)
+        self.outbox = Outbox(self.settings, known, required=self.required)
         trimmed = kept.get(numbered(TRIMMED, 0))
         messages = [kept[key] for key in sorted(kept) if key[:1] == MESSAGE]
         ends = {int.from_bytes(k[9:], "big"): np.frombuffer(v) for k, v in kept.items() if k[:1] == ENDS}
@@ -243,9 +245,23 @@ class OutboxOfRequiredNodes(OutboxMachine):
     nodes = ("a", "b", "c")
 
 
+class OutboxOfSeveralSteps(OutboxMachine):
+    """What is put covers three steps, but for the hello, the end, and what a process before this one has left."""
+
+    settings = PublishSettings(window=WINDOW, outbox_max=OUTBOX_MAX, every_steps=3)
+
+    @invariant()
+    def what_was_put_is_whole(self) -> None:
+        for data in self.put if not self.closed else []:
+            message = decode_message(data)
+            assert message.end or message.hello or message.last - message.first + 1 >= 3
+
+
+OutboxOfSeveralSteps.TestCase.settings = settings(settled, max_examples=30, stateful_step_count=20)
 OutboxMachine.TestCase.settings = settings(settled, max_examples=30, stateful_step_count=20)
 OutboxOfRequiredNodes.TestCase.settings = settings(settled, max_examples=30, stateful_step_count=20)
 test_an_outbox_keeps_its_laws_under_any_sequence_of_calls = OutboxMachine.TestCase
+test_an_outbox_whose_messages_cover_several_steps_keeps_its_laws = OutboxOfSeveralSteps.TestCase
 test_an_outbox_that_several_nodes_must_acknowledge_keeps_its_laws = OutboxOfRequiredNodes.TestCase
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fleet_seif.joint import solve
+from fleet_seif.wire import decode_message
 from scenarios.report import Outcome
 from tests import real_data
 from tests.fleets import outcome_of, run_virtual
@@ -84,6 +85,19 @@ def test_a_small_window_and_a_small_outbox_do_not_change_the_map() -> None:
     )  # fmt: skip
     assert tight.ledger.map_digest() == plain.ledger.map_digest()
     assert max(len(s.log) for s in tight.ledger.streams.values()) < 100
+
+
+@pytest.mark.parametrize("frames", ["single", "adaptive"])
+def test_messages_of_several_steps_give_the_same_map_with_fewer_bytes(frames: str) -> None:
+    """A message ends where a frame does, so that none covers more than a frame."""
+    settings = ("world.steps=150", f"filter.frames={frames}")
+    runs = [run_virtual("three_air_vehicles_mild", *settings, f"publish.every_steps={n}", seed=2) for n in (1, 5, 100)]
+    assert len({run.ledger.map_digest() for run in runs}) == 1
+    put = [sum(each.bytes_put for each in run.drives.values()) for run in runs]
+    assert put[0] > 2 * put[1] > 2 * put[2]
+    messages = [decode_message(data) for s in runs[-1].ledger.streams.values() for data in s.log]
+    covered = [message.last - message.first + 1 for message in messages]
+    assert max(covered) == (25 if frames == "adaptive" else 100)
 
 
 def test_bytes_per_step_do_not_grow_with_the_map() -> None:

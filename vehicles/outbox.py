@@ -2,6 +2,7 @@
 
 1. A message may be put once it has been committed to the store; at most `window` past the last acknowledgement are.
 2. A message is fixed for ever once its bytes may have been put; before that it may be coalesced with its neighbour.
+   The newest takes in what follows until it covers `every_steps` or a frame ends; until then it is not put.
 3. Above `outbox_max` messages a pair of those that are not fixed becomes one: nothing is lost, the stream gets coarser.
 4. A message is forgotten when every required node (none required: any node) has acknowledged a check point at or after
    it, so that a snapshot is always one of a check point. A snapshot is all that the epoch has published less what is
@@ -130,10 +131,24 @@ class Outbox:
             self.record = dataclasses.replace(self.record, hello=data)
             self.changes.append(Put(records.numbered(records.EPOCH, self.ordinal), self.record.pack()))
         self.last, self.ended = message.last, message.end
+        grows = len(self._unsent) > self._fixed and self._is_open(self._unsent[-1])
         self._unsent.append(_Unsent(message, data, self.commits))
         self.changes.append(Put(records.numbered(records.MESSAGE, self.ordinal, message.first), data))
+        if grows:
+            self._join(len(self._unsent) - 2)
         if len(self._sent) + len(self._unsent) > self._settings.outbox_max:
             self._coalesce()
+
+    def _is_open(self, waiting: _Unsent) -> bool:
+        """Whether a message is to take in those that follow."""
+        message = waiting.message
+        return (
+            message.last - message.first + 1 < self._settings.every_steps
+            and message.hello is None
+            and not message.end
+            and len(waiting.data) <= COALESCED_MAX
+            and not any(part.status is FrameStatus.ENDED for part in message.parts)
+        )
 
     def _coalesce(self) -> None:
         """Make one message of the next pair; the pairs are taken in turn, so that all get coarser alike."""
@@ -148,12 +163,17 @@ class Outbox:
             self._next_pair += 1
         else:
             return
+        self._join(self._next_pair)
+        self._next_pair += 1
+
+    def _join(self, at: int) -> None:
+        """Make one of two unsent messages."""
+        a, b = self._unsent[at], self._unsent[at + 1]
         pair = Coalescer(a.message)
         pair.add(b.message)
         a.message = pair.message()
         a.data, a.commit = encode_message(a.message, self._signer), self.commits
-        del self._unsent[self._next_pair + 1]
-        self._next_pair += 1
+        del self._unsent[at + 1]
         low, high = (records.numbered(records.MESSAGE, self.ordinal, n) for n in (a.message.first, a.message.last + 1))
         self.changes += [Delete(low, high), Put(low, a.data)]
 
@@ -177,6 +197,8 @@ class Outbox:
         released: list[bytes] = []
         room = self._settings.window - (len(self._sent) - self._acknowledged)
         while self._unsent and len(released) < room and self._unsent[0].commit <= self.committed:
+            if not self._fixed and len(self._unsent) == 1 and self._is_open(self._unsent[0]):
+                break
             waiting = self._unsent.popleft()
             self._next_pair, self._fixed = max(self._next_pair - 1, 0), max(self._fixed - 1, 0)
             self.prefix_digest = extend_prefix(self.prefix_digest, body_digest(waiting.data))
