@@ -50,7 +50,7 @@ class FilterSettings(Settings):
     gate_patience: Annotated[int, Field(ge=1, le=1000)] = 3
     start_information: Annotated[float, Field(gt=0, le=1e9)] = 1e6
     step_information_max: Annotated[float, Field(gt=0, le=1e9)] = 1e9
-    frames: Literal["single", "adaptive"] = "single"
+    frames: Literal["single", "adaptive"] = "adaptive"
     frame_steps_max: Annotated[int, Field(ge=1, le=10_000)] = 25
     frame_landmarks_max: Annotated[int, Field(ge=2, le=1000)] = 60
     frame_heading_std_max_rad: Positive = 0.5

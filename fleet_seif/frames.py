@@ -6,10 +6,13 @@
    frame alone then replaces its posterior: the difference to what was published is a correction, published with the
    message of the step `close_lag_steps` later, or with the end. Where the batch fails the filter's posterior stays.
 4. What is published is a function of this vehicle's own readings and settings, never of timing or of the joint map.
-5. With frames = "single" there is one, which closes at the end and is never corrected.
+5. Where frames start, and the map, is the joint solution of this vehicle's own frames, the open one included: whoever
+   owns the filter calls `localise` after a step. Between two solutions the open frame's filter goes on from there.
+6. With frames = "single" there is one, which closes at the end and is never corrected.
 """
 
 import dataclasses
+import logging
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,16 +24,19 @@ from fleet_seif.errors import NumericalError
 from fleet_seif.filters import Names, StepResult
 from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
 from fleet_seif.frame_deltas import quantised, renumbered
-from fleet_seif.geometry import compose
+from fleet_seif.geometry import act_all, compose
 from fleet_seif.information import FrameDelta, FrameTotal
-from fleet_seif.joint import Life, landmark_names, solve
+from fleet_seif.joint import JointSolution, Life, landmark_names, solve
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Ints, Reading, Sightings
 from fleet_seif.seif import Seif
 
+log = logging.getLogger(__name__)
 FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
+LOCALISE_STEPS = 5
+"""Steps after which the vehicle's own frames are solved anew."""
 
 
 @dataclass
@@ -113,6 +119,9 @@ class FramedFilter:
         self.steps = 0
         self.totals: list[FrameTotal] = []
         self.ends: list[Floats] = []
+        self._origin = 0, np.zeros(3)
+        self._map = np.empty((0, 2))
+        self._localised = self._asked = 0
         self._single = settings.frames == "single"
         self._frame_settings = settings
         if not self._single:
@@ -137,29 +146,64 @@ class FramedFilter:
     @property
     def pose(self) -> Floats:
         """Live pose in the coordinates of frame 0, (x m, y m, theta rad), shape (3,)."""
-        pose = self.filter.pose
-        for end in reversed(self.ends):
-            pose = compose(end, pose)
+        return compose(self._open_pose, self.filter.pose)
+
+    @property
+    def _open_pose(self) -> Floats:
+        """Where the open frame starts: the last solution, and the ends of the frames that have closed since."""
+        frame, pose = self._origin
+        for end in self.ends[frame:]:
+            pose = compose(pose, end)
         return pose
 
     @property
     def landmarks(self) -> Floats:
-        """Live landmarks in the coordinates of frame 0, m, shape (n, 2), by number.
-
-        Of several frames, the solution of the joint system of all of them, so it takes as long as that.
-        """
+        """Live landmarks in the coordinates of frame 0, m, shape (n, 2), by number; NaN for one that is none."""
         if self._single:
             return self.filter.landmarks
-        if not self.published():
-            return np.empty((0, 2))
-        life = Life(
+        found = np.full((len(self.signatures), 2), np.nan)
+        found[: len(self._map)] = self._map
+        own = np.array(self._numbers, np.int64)
+        new = np.isnan(found[own, 0])
+        found[own[new]] = act_all(self._open_pose, self.filter.landmarks[new])
+        return found
+
+    @property
+    def is_localisation_due(self) -> bool:
+        """Whether enough has happened since the last `own_life`."""
+        return self.frame > 0 and self.steps >= self._localised + LOCALISE_STEPS and not self._single
+
+    def localise(self) -> None:
+        """Solve this vehicle's own frames, if that is due. Where another thread solves, in three parts: `own_life`,
+        `solve_own` (which needs nothing else), `take_solution`."""
+        if self.is_localisation_due:
+            self.take_solution(self.solve_own(self.own_life()))
+
+    def own_life(self) -> Life:
+        """What this vehicle has published, in the coordinates of frame 0."""
+        self._localised, self._asked = self.steps, self.frame
+        return Life(
             vehicle="", life=0, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)), frames=self.published(),
             signatures=tuple(self.signatures),
         )  # fmt: skip
-        found = np.full((len(self.signatures), 2), np.nan)
-        solution = solve([life], tuple((name,) for name in landmark_names(life)))
-        found[[names[0].number for names in solution.classes]] = solution.landmark_mean
-        return found
+
+    def solve_own(self, life: Life) -> JointSolution | None:
+        """The joint solution of `own_life`; None where there is none."""
+        try:
+            return solve([life], tuple((name,) for name in landmark_names(life)))
+        except NumericalError as error:
+            log.warning("not_localised reason=%s", error)
+            return None
+
+    def take_solution(self, solution: JointSolution | None) -> None:
+        """Take what `solve_own` found."""
+        if solution is None:
+            return
+        starts = [k for _, _, k in solution.poses]
+        last = self._asked if self._asked in starts else -1
+        self._origin = self._asked, solution.pose_mean[starts.index(last)]
+        self._map = np.full((len(self.signatures), 2), np.nan)
+        self._map[[names[0].number for names in solution.classes]] = solution.landmark_mean
 
     @property
     def frame(self) -> int:
@@ -265,6 +309,7 @@ class FramedFilter:
         for closed in self._closed:
             parts += self._correction(closed)
         self._closed.clear()
+        self._localised = self.steps - LOCALISE_STEPS
         return tuple(parts)
 
     def state(self) -> dict[str, Any]:
@@ -286,6 +331,7 @@ class FramedFilter:
         """Go on where `state` was taken, to the bit. Raises ValueError where it is not the state of a filter."""
         self.filter.restore(state["filter"])
         self.steps, self._opened = state["steps"], state["opened"]
+        self._origin, self._localised = (0, np.zeros(3)), self.steps - LOCALISE_STEPS
         self.names = Names()
         if self._single:
             self.names.add(self.filter.signatures)

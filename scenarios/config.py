@@ -40,7 +40,6 @@ class RunSettings(Settings):
 
     rate_hz: NotNegative = 0.0
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
-    frames: Literal["single"] = "single"
 
 
 class Scenario(Settings):

@@ -175,6 +175,7 @@ class SimVehicle(Process):
             return
         if self._taken == len(self._readings):
             core.end()
+            core.filter.localise()
             self._serve_soon()
             return
         self._taken += 1
@@ -182,7 +183,9 @@ class SimVehicle(Process):
         begin = time.perf_counter()
         with contextlib.suppress(ReadingRefused, NumericalError):  # counted by the core
             core.step(self._readings[step - 1])
-        self.notes.take(step, core.pose, time.perf_counter() - begin)
+        took = time.perf_counter() - begin
+        core.filter.localise()
+        self.notes.take(step, core.pose, took)
         self._serve_soon()
         self._simulation.on_step(self.name, step)
         self.later(1.0 / scenario.run.rate_hz if scenario.run.rate_hz else LATENCY_S, self._step)

@@ -28,7 +28,9 @@ def run(settings: FilterSettings, log: Drive) -> tuple[FramedFilter, list[tuple[
     """A filter after a whole run, and the parts of each message."""
     framed = FramedFilter(settings)
     said = [framed.start(log.start)[1], *(framed.step(each)[1] for each in log.readings)]
-    return framed, [*said, framed.end()]
+    said.append(framed.end())
+    framed.localise()
+    return framed, said
 
 
 def sums(said: Sequence[Sequence[FramePart]]) -> list[FrameDelta]:

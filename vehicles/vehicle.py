@@ -4,7 +4,8 @@
 2. Without a bus, everything else works; messages are kept (and coalesced) in the outbox.
 3. `step` never waits for the network or the disk; `wait_for_room` does, for those who want to. Several steps may share
    one commit; nothing is put before it is committed.
-4. A store that fails ends it: from then on every call raises what went wrong.
+4. Another thread solves the vehicle's own frames, for `pose` and `landmarks`; without a bus or a store `step` does.
+5. A store that fails ends it: from then on every call raises what went wrong.
 """
 
 import contextlib
@@ -108,7 +109,10 @@ class Vehicle:
         self._lock = threading.Lock()
         self._acknowledged = threading.Condition(self._lock)
         self._acks: queue.Queue[bytes | None] = queue.Queue(ACKS_MAX)
-        self._thread: threading.Thread | None = None
+        self._threads: list[threading.Thread] = []
+        self._moved = threading.Event()
+        self._solving = threading.Lock()
+        self._closing = False
         self._failure: Exception | None = None
         self.filter_s = 0.0
         self.publish_s = 0.0
@@ -117,8 +121,12 @@ class Vehicle:
             bus.answer(self._keys.outbox(name), lambda _, data: self._on_range(data))
             bus.announce(self._keys.alive(name))
         if bus is not None or store is not None:
-            self._thread = threading.Thread(target=self._serve, name=f"vehicle-{name}", daemon=True)
-            self._thread.start()
+            self._threads = [
+                threading.Thread(target=self._serve, name=f"vehicle-{name}", daemon=True),
+                threading.Thread(target=self._localise_for_ever, name=f"localiser-{name}", daemon=True),
+            ]
+            for thread in self._threads:
+                thread.start()
 
     def _put_ack(self, data: bytes) -> None:
         if not self._acks.full():  # a later acknowledgement says all that a dropped one said
@@ -156,6 +164,25 @@ class Vehicle:
             for heartbeat in heartbeats:
                 self._bus.put(self._keys.heartbeats(self._core.identity.vehicle), heartbeat, "control")
         return data is not None
+
+    def _localise_for_ever(self) -> None:
+        while True:
+            self._moved.wait()
+            self._moved.clear()
+            if self._closing:
+                return
+            self._localise()
+
+    def _localise(self) -> None:
+        """Solve the vehicle's own frames if that is due; the caller does not hold the lock, so that steps go on."""
+        with self._solving:
+            framed = self._core.filter
+            with self._lock:
+                life = framed.own_life() if framed.is_localisation_due else None
+            if life is not None:
+                solution = framed.solve_own(life)
+                with self._lock:
+                    framed.take_solution(solution)
 
     def _commit(self) -> None:
         """Make durable what has changed; the caller does not hold the lock, so that steps go on meanwhile."""
@@ -227,7 +254,12 @@ class Vehicle:
             middle = time.perf_counter()
             self._hand_over()
             self.filter_s, self.publish_s = middle - begin, time.perf_counter() - middle
-            return result
+            due = self._core.filter.is_localisation_due
+        if due and self._threads:
+            self._moved.set()
+        elif due:
+            self._localise()
+        return result
 
     def _time(self, time_s: float | None) -> float:
         return self._clock() if time_s is None else float(time_s)
@@ -238,6 +270,7 @@ class Vehicle:
             self._check()
             self._core.end()
             self._hand_over()
+        self._localise()
 
     def wait_for_room(self, timeout_s: float | None = None) -> bool:
         """Wait until fewer than `publish.window` messages are unacknowledged. False after the timeout."""
@@ -311,11 +344,14 @@ class Vehicle:
 
     def close(self) -> None:
         """Commit what is left and stop the thread. Bus and store are the caller's to close."""
-        if self._thread is not None:
+        if self._threads:
+            self._closing = True
+            self._moved.set()
             with contextlib.suppress(queue.Full):
                 self._acks.put(None, timeout=CLOSE_S)
-            self._thread.join(CLOSE_S)
-            self._thread = None
+            for thread in self._threads:
+                thread.join(CLOSE_S)
+            self._threads = []
 
     def __enter__(self) -> "Vehicle":
         return self

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from scenarios.config import ScenarioError
-from scenarios.experiments import confidence, correlation, cost, error, fleet, sparsity
+from scenarios.experiments import bandwidth, confidence, correlation, cost, error, fleet, sparsity
 from scenarios.experiments.study import HEADS, Progress, Row, prepare_folder, summary_of, write_summary
 
 
@@ -37,6 +37,7 @@ EXPERIMENTS: Final = {
         Experiment(name=sparsity.NAME, title=sparsity.TITLE, run=sparsity.run),
         Experiment(name=confidence.NAME, title=confidence.TITLE, run=confidence.run),
         Experiment(name=fleet.NAME, title=fleet.TITLE, run=fleet.run),
+        Experiment(name=bandwidth.NAME, title=bandwidth.TITLE, run=bandwidth.run),
     )
 }
 
