@@ -56,9 +56,7 @@ def landmark_names(life: Life) -> list[LandmarkName]:
     return [LandmarkName(life.vehicle, life.life, number) for number in numbers]
 
 
-def landmark_classes(
-    lives: Sequence[Life], forced: Sequence[Pair] = (), forbidden: Sequence[Pair] = ()
-) -> Classes:
+def landmark_classes(lives: Sequence[Life], forced: Sequence[Pair] = (), forbidden: Sequence[Pair] = ()) -> Classes:
     """Which landmarks are the same: those that carry one signature. In canonical order of their first names.
 
     Landmarks whose rows are all zero in every frame are none and do not appear.
@@ -80,9 +78,7 @@ def landmark_classes(
     return tuple(sorted(tuple(sorted(group)) for group in groups.values()))
 
 
-def _joined(
-    names: Sequence[LandmarkName], pairs: Sequence[Pair], forbidden: Sequence[Pair]
-) -> Classes:
+def _joined(names: Sequence[LandmarkName], pairs: Sequence[Pair], forbidden: Sequence[Pair]) -> Classes:
     """Classes of names: pairs are joined in order, but for those that would put a forbidden pair into one class."""
     classes = {name: {name} for name in names}
     apart: dict[LandmarkName, set[LandmarkName]] = {}

@@ -1,6 +1,7 @@
 """What frames say about the joint state at X: cost, gradient, and their part of the joint information matrix.
 
-With z_f = (T_f^-1 T_f+1, T_f^-1 y_j ...), the frame's own mean m_f, r = z_f - m_f (its heading on the branch nearest 0):
+With z_f = (T_f^-1 T_f+1, T_f^-1 y_j ...), the frame's own mean m_f, r = z_f - m_f (its heading without whole turns,
+which stay the same while the cost is brought down: it is smooth):
 
     chi_f = r' H_f r        cost = sum_f rho(chi_f) + priors        g = sum_f w_f J_f' (-H_f r) + priors
     H = sum_f w_f J_f' H_f J_f + priors
@@ -22,7 +23,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 
-from fleet_seif.geometry import wrap
 from fleet_seif.jit import kernel
 from fleet_seif.joint_frames import Frames, row_of
 from fleet_seif.records import Floats, Ints
@@ -30,13 +30,12 @@ from fleet_seif.records import Floats, Ints
 
 class Evaluation(NamedTuple):
     """What frames say at X (v, 3): the cost, minus half its gradient g (v, 3); by frame its chi-square and weight, by
-    row of a frame its view z and its pull q = w H_f r."""
+    row of a frame its view z."""
 
     X: Floats
     cost: float
     g: Floats
     z: Floats
-    q: Floats
     chi_square: Floats
     weight: Floats
 
@@ -106,17 +105,29 @@ def _pull_into(g: Floats, frames: Frames, f: int, X: Floats, q: Floats) -> None:
 
 
 @kernel
-def evaluate_into(
-    g: Floats, z: Floats, q: Floats, chi_square: Floats, weight: Floats, frames: Frames, chosen: Ints, X: Floats
-) -> float:
-    """Cost, gradient, and each chosen frame's view, pull w H_f r, chi-square and weight at X. Returns the cost.
+def turns_into(turns: Floats, frames: Frames, chosen: Ints, X: Floats) -> None:
+    """Whole turns to take off what headings of frames (column 0) and of priors (column 1) differ from theirs, rad."""
+    for f in chosen:
+        t, first, row = frames.start[f], frames.first_variable[f], frames.first_row[f]
+        angle = frames.given[f, 2] if t < 0 else X[t, 2]
+        if frames.first_variable[f + 1] > first:
+            ahead = X[frames.variable[first], 2] - angle - frames.mean[row + 2]
+            turns[f, 0] = 2.0 * math.pi * math.floor(ahead / (2.0 * math.pi) + 0.5)
+        turns[f, 1] = 2.0 * math.pi * math.floor((angle - frames.given[f, 2]) / (2.0 * math.pi) + 0.5)
 
-    g (v, 3): zero at first. z, q (n,): rows of all frames. chi_square, weight (f,).
+
+@kernel
+def evaluate_into(
+    g: Floats, z: Floats, chi_square: Floats, weight: Floats, frames: Frames, chosen: Ints, X: Floats, turns: Floats
+) -> float:
+    """Cost, gradient, and each chosen frame's view, chi-square and weight at X. Returns the cost.
+
+    g (v, 3): zero at first. z (n,): rows of all frames. chi_square, weight (f,). turns (f, 2): see turns_into.
     """
     most = 0
     for f in chosen:
         most = max(most, frames.first_row[f + 1] - frames.first_row[f])
-    r, cost = np.empty(most), 0.0
+    r, q, cost = np.empty(most), np.empty(most), 0.0
     for f in chosen:
         begin, end = frames.first_row[f], frames.first_row[f + 1]
         n = end - begin
@@ -124,31 +135,31 @@ def evaluate_into(
         for i in range(n):
             r[i] = z[begin + i] - frames.mean[begin + i]
         if n > 0:
-            r[2] = wrap(r[2])
-        _times_into(q[begin:end], frames, f, r)
+            r[2] -= turns[f, 0]
+        _times_into(q[:n], frames, f, r)
         chi = 0.0
         for i in range(n):
-            chi += r[i] * q[begin + i]
+            chi += r[i] * q[i]
         limit = frames.limit[f]
         chi_square[f], weight[f] = chi, 1.0
         if chi > limit:
             weight[f] = math.sqrt(limit / chi)
             chi = 2.0 * math.sqrt(limit * chi) - limit
         cost += chi
-        for i in range(begin, end):
+        for i in range(n):
             q[i] *= weight[f]
-        _pull_into(g, frames, f, X, q[begin:end])
+        _pull_into(g, frames, f, X, q)
         if frames.start[f] >= 0:
-            cost += _prior_into(g, frames, f, X)
+            cost += _prior_into(g, frames, f, X, turns[f, 1])
     return cost
 
 
 @kernel
-def _prior_into(g: Floats, frames: Frames, f: int, X: Floats) -> float:
+def _prior_into(g: Floats, frames: Frames, f: int, X: Floats, turn: float) -> float:
     """Cost of the prior of T_f, and its part of g."""
     t, cost = frames.start[f], 0.0
     d = X[t] - frames.given[f]
-    d[2] = wrap(d[2])
+    d[2] -= turn
     for a in range(3):
         q = 0.0
         for b in range(3):
@@ -232,7 +243,7 @@ def _world_block_into(B: Floats, frames: Frames, k: int, c: float, s: float, wei
 
 @kernel
 def _put_block(F: Floats, i: int, j: int, B: Floats, rows: int, cols: int, diagonal: bool) -> None:
-    """Add a block and its transpose to F at (i, j). At i = j: the block alone where it is of the diagonal, else both."""
+    """Add a block and its transpose to F at (i, j). At i = j: the block alone where it is diagonal, else both."""
     for a in range(rows):
         for b in range(a if diagonal else 0, cols):
             x = 2.0 * B[a, b] if i == j and a == b and not diagonal else B[a, b]
@@ -244,7 +255,7 @@ def _put_turned(
     F: Floats, t: int, j: int, T: Floats, B: Floats, transposed: bool, rows: int, cols: int,
     d_i: tuple[float, float], d_j: tuple[float, float],
 ) -> None:  # fmt: skip
-    """Add -G_i'B to F at (t, j), and G_i'B G_j to T. B or its transpose, (rows, cols); d_i, d_j: from T_f to the points."""
+    """Add -G_i'B to F at (t, j), and G_i'B G_j to T. B or its transpose, (rows, cols); d_i, d_j: points less t_f."""
     for b in range(cols):
         B_0, B_1 = (B[b, 0], B[b, 1]) if transposed else (B[0, b], B[1, b])
         turn = d_i[0] * B_1 - d_i[1] * B_0
@@ -265,58 +276,11 @@ def _put_turned(
 
 
 @kernel
-def _add_curvature_into(F: Floats, frames: Frames, f: int, at: Evaluation, place: Ints) -> None:
-    """What a frame adds to half the cost's second derivative beyond w J' H_f J.
-
-    z turns with T_f: sum_k q_k d2z_k, where the q are those of x and y and d2z / dtheta2 = -z. Where the frame is
-    weighted down, its pull does not grow with its residual: -u u' / (w chi) with u = J'q.
-    """
-    first, start = frames.first_variable[f], frames.start[f]
-    count, row = frames.first_variable[f + 1] - first, frames.first_row[f]
-    tx, ty, angle = _pose_of(frames, f, at.X)
-    c, s = math.cos(angle), math.sin(angle)
-    at_row, u, n = np.empty(2 * count + 4, np.int64), np.empty(2 * count + 4), 0
-    t, turn = place[start] if start >= 0 else 0, np.zeros(3)
-    for k in range(count):
-        v = frames.variable[first + k]
-        q_0, q_1, i = at.q[row], at.q[row + 1], place[v]
-        u_0, u_1 = c * q_0 - s * q_1, s * q_0 + c * q_1
-        at_row[n], at_row[n + 1], u[n], u[n + 1] = i, i + 1, u_0, u_1
-        turn[0] -= u_0
-        turn[1] -= u_1
-        turn[2] -= (at.X[v, 0] - tx) * u_1 - (at.X[v, 1] - ty) * u_0
-        if start >= 0:  # d2z / dtheta dy = dR'/dtheta, and minus that with t_f
-            F[min(t + 2, i), max(t + 2, i)] -= u_1
-            F[min(t + 2, i + 1), max(t + 2, i + 1)] += u_0
-            F[t, t + 2] += u_1
-            F[t + 1, t + 2] -= u_0
-            F[t + 2, t + 2] -= q_0 * at.z[row] + q_1 * at.z[row + 1]
-        n += 2
-        row += 2
-        if k == 0:
-            at_row[n], u[n] = i + 2, at.q[row]
-            turn[2] -= at.q[row]
-            n += 1
-            row += 1
-    if start >= 0:
-        for a in range(3):
-            at_row[n], u[n] = t + a, turn[a]
-            n += 1
-    if at.weight[f] < 1.0:
-        share = 1.0 / (at.weight[f] * at.chi_square[f])
-        for a in range(n):
-            for b in range(n):
-                if at_row[a] <= at_row[b]:
-                    F[at_row[a], at_row[b]] -= share * u[a] * u[b]
-
-
-@kernel
-def add_pieces_into(F: Floats, frames: Frames, pieces: Ints, at: Evaluation, place: Ints, curved: bool) -> None:
+def add_pieces_into(F: Floats, frames: Frames, pieces: Ints, at: Evaluation, place: Ints) -> None:
     """Add pieces of frames, w J' H_f J, to F (n, n): its upper triangle.
 
     pieces (p, 3): frame, first and last block + 1, counted within the frame. place (v,): where in F a joint variable
-    begins. The first piece of a frame brings the prior of T_f. curved: whether frames in one piece bring the rest of
-    the second derivative too.
+    begins. The first piece of a frame brings the prior of T_f.
     """
     B, T = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(pieces)):
@@ -341,8 +305,6 @@ def add_pieces_into(F: Floats, frames: Frames, pieces: Ints, at: Evaluation, pla
                 _put_turned(F, t, place[v], T, B, True, cols, rows, d_w, d_v)
         if start >= 0:
             _put_block(F, place[start], place[start], T, 3, 3, True)
-        if curved and pieces[n, 2] - pieces[n, 1] == frames.first_block[f + 1] - frames.first_block[f]:
-            _add_curvature_into(F, frames, f, at, place)
 
 
 @kernel
@@ -365,18 +327,21 @@ def assembled(
         rows, size: first row and number of rows of each joint variable.
     """
     place = np.zeros(len(rows), np.int64)
-    i, j, values = [], [], []
+    i: list[Ints] = []
+    j: list[Ints] = []
+    values: list[Floats] = []
     for piece, variables in zip(pieces, members, strict=True):
         sizes = size[variables]
         ends = np.cumsum(sizes)
         place[variables] = ends - sizes
         own = np.repeat(rows[variables] - place[variables], sizes) + np.arange(sizes.sum())
         U = np.zeros((len(own), len(own)))
-        add_pieces_into(U, frames, piece[None], at, place, False)
+        add_pieces_into(U, frames, piece[None], at, place)
         triplet = np.empty(U.size, np.int64), np.empty(U.size, np.int64), np.empty(U.size)
         _upper_into(*triplet, U, own)
-        for part, each in zip((i, j, values), triplet, strict=True):
-            part.append(each)
+        i.append(triplet[0])
+        j.append(triplet[1])
+        values.append(triplet[2])
     entries = (np.concatenate(values), (np.concatenate(i), np.concatenate(j)))
     H = scipy.sparse.coo_array(entries, shape=(n, n)).tocsr()
     return scipy.sparse.csr_array((H + H.T) * 0.5)  # rounding depends on the order of addition

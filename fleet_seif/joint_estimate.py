@@ -6,7 +6,9 @@
    tolerance shrinks.
 2. A step that raises the cost is not taken: first all frames are linearised anew, then the step is damped
    (Levenberg): the diagonal grows by a share that is tenfold after each failure and a tenth after each success.
-3. Frames that are taken in are placed from where their first pose is and what they saw; what is known stays.
+3. Whole turns of headings are chosen where `settle` begins and stay: were they chosen at each step, the cost would
+   jump where a frame is half a turn off, and no step would bring it down.
+4. Frames that are taken in are placed from where their first pose is and what they saw; what is known stays.
 """
 
 from collections.abc import Sequence
@@ -15,14 +17,14 @@ from typing import Final
 import numpy as np
 
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint_assembly import Evaluation, evaluate_into, moved_frames, place_into, remember_into
+from fleet_seif.joint_assembly import Evaluation, evaluate_into, moved_frames, place_into, remember_into, turns_into
 from fleet_seif.joint_frames import Frames, Placed
 from fleet_seif.joint_registry import Change, Registry
 from fleet_seif.joint_tree import Piece, Tree
 from fleet_seif.records import Floats, Ints
 
 SETTLED: Final = 1e-13
-"""An estimate has settled where the next step would be shorter than this, in sigmas squared over all variables."""
+"""An estimate has settled where a step is shorter than this, in sigmas squared over all variables."""
 ROUNDING: Final = 1e-10
 """Where a step is shorter than this per variable, in sigmas squared, and steps no longer shrink, rounding is all that
 is left."""
@@ -37,9 +39,6 @@ SLACK: Final = 1e-9
 DAMPING_FIRST: Final = 1e-4
 DAMPING_FACTOR: Final = 10.0
 DAMPING_MAX: Final = 1e9
-GOOD: Final = 0.75
-BAD: Final = 0.25
-"""What a step gained of what it promised: above, damping is a tenth; below, tenfold."""
 
 
 class Estimate:
@@ -136,12 +135,17 @@ class Estimate:
             found.append(Piece(f, first, last, variables, (x, y)))
         return found
 
-    def evaluate(self, X: Floats, active: Ints) -> Evaluation:
+    def _turns(self, active: Ints) -> Floats:
+        turns = np.zeros((len(self.frames.start), 2))
+        turns_into(turns, self.frames, active, self.X)
+        return turns
+
+    def _evaluate(self, X: Floats, active: Ints, turns: Floats) -> Evaluation:
         """Cost and gradient of the frames that take part, at X."""
-        g, z, q = np.zeros_like(X), np.zeros(len(self.frames.mean)), np.zeros(len(self.frames.mean))
+        g, z = np.zeros_like(X), np.zeros(len(self.frames.mean))
         chi_square, weight = np.zeros(len(self.frames.start)), np.ones(len(self.frames.start))
-        cost = evaluate_into(g, z, q, chi_square, weight, self.frames, active, X)
-        return Evaluation(X, cost, g, z, q, chi_square, weight)
+        cost = evaluate_into(g, z, chi_square, weight, self.frames, active, X, turns)
+        return Evaluation(X, cost, g, z, chi_square, weight)
 
     def settle(self, iterations: int, enough: float = SETTLED) -> tuple[bool, Evaluation]:
         """Improve the estimate until a step is shorter than `enough`. Returns whether it was, and the evaluation there.
@@ -149,54 +153,37 @@ class Estimate:
         Raises NumericalError where the joint information matrix is not positive definite.
         """
         active = self.active
-        now, last, tolerance, curved = self.evaluate(self.X, active), np.inf, TOLERANCE_FIRST, False
+        turns = self._turns(active)
+        now, last, tolerance = self._evaluate(self.X, active, turns), np.inf, TOLERANCE_FIRST
         for _ in range(iterations):
-            try:
-                step = self._step(now, active, tolerance, curved)
-            except NumericalError:
-                if not curved:
-                    raise
-                curved = False
-                self._damp()
-                continue
+            step = self._step(now, active, tolerance)
             length = float(np.vdot(now.g, step))
             if not np.isfinite(length):
                 raise NumericalError("the joint map has no finite solution: information of frames is too lopsided")
-            then = self.evaluate(self.X + step, active)
-            slack = SLACK * (1.0 + now.cost)
+            then = self._evaluate(self.X + step, active, turns)
             short = length * (1.0 + self.damping) ** 2 <= enough
             short |= length <= ROUNDING * len(self.X) and length > 0.9 * last and not self.damping
-            if then.cost <= now.cost + slack or short:
-                gain = (now.cost - then.cost) / length if length > slack else last / length
+            if then.cost <= now.cost * (1.0 + SLACK) + SLACK or short:
                 self.X, now = then.X, then
                 if short:
                     return True, now
-                if gain > GOOD:
-                    self.damping = self.damping / DAMPING_FACTOR if self.damping > DAMPING_FIRST else 0.0
-                elif gain < BAD:
-                    self._damp()
+                self.damping = self.damping / DAMPING_FACTOR if self.damping > DAMPING_FIRST else 0.0
                 if length > SLOW * last:
-                    curved = tolerance <= TOLERANCE_LEAST
                     tolerance = max(tolerance / 10.0, TOLERANCE_LEAST)
                 last = length
             elif tolerance > TOLERANCE_LEAST:
                 tolerance = TOLERANCE_LEAST
-            elif not curved and not self.damping:
-                curved = True
             else:
-                self._damp()
+                self.damping = max(DAMPING_FIRST, self.damping * DAMPING_FACTOR)
                 if self.damping > DAMPING_MAX:
                     break
         return False, now
 
-    def _damp(self) -> None:
-        self.damping = max(DAMPING_FIRST, self.damping * DAMPING_FACTOR)
-
-    def _step(self, now: Evaluation, active: Ints, tolerance: float, curved: bool) -> Floats:
+    def _step(self, now: Evaluation, active: Ints, tolerance: float) -> Floats:
         moved = moved_frames(
             self.frames, active, self.X, now.z, now.weight, self._heading, self._z, self._weight, tolerance
         )
         self.tree.relinearise([piece for f in moved.tolist() for piece in self._pieces[f]])
         remember_into(self._heading, self._z, self._weight, self.frames, moved, self.X, now.z, now.weight)
-        self.redone += self.tree.factor(self.frames, now, self.damping, curved=curved)
+        self.redone += self.tree.factor(self.frames, now, self.damping)
         return self.tree.solve(now.g)

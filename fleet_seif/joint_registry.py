@@ -148,11 +148,11 @@ class Registry:
     def _placed(self, key: FrameKey, delta: FrameDelta, record: FrameRecord, table: Ints, start: _Start) -> Placed:
         """A frame with its joint variables. Raises ValueError where a landmark is in no class."""
         vehicle, life, f = key
-        if f > 0:
-            first, given, prior = self.pose(vehicle, life, f), np.zeros(3), np.zeros((3, 3))
-        else:
-            first, given = start.variable, start.given
-            prior = np.linalg.inv(start.cov) if first >= 0 else np.zeros((3, 3))
+        first, given, prior = self.pose(vehicle, life, f) if f > 0 else start.variable, np.zeros(3), np.zeros((3, 3))
+        if f <= 0:
+            given = start.given
+            if first >= 0:
+                prior = np.asarray(np.linalg.inv(start.cov))
         landmarks = table[delta.variables[delta.variables != POSE] - 1]
         if np.any(landmarks < 0):
             raise ValueError(f"frame {f} of {vehicle} has a landmark that is in no class: classes are of other lives")

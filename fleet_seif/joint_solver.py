@@ -22,8 +22,11 @@ from fleet_seif.joint_registry import Records, Registry
 from fleet_seif.messages import LandmarkName
 from fleet_seif.records import Ints
 
-ITERATIONS_MAX: Final = 100
-WARM_ITERATIONS_MAX: Final = 40
+ITERATIONS_MAX: Final = 400
+"""Frames that contradict each other strongly make the last steps shrink slowly."""
+WARM_ITERATIONS_MAX: Final = 100
+WARM_ENOUGH: Final = 1e-6
+"""An update is over when a step is shorter than this, in sigmas squared over all variables."""
 ROUND_ITERATIONS: Final = 8
 ROUND_ENOUGH: Final = 1e-2
 """A round is over when a step is shorter than this, in sigmas squared over all variables."""
@@ -72,7 +75,7 @@ class JointSolver:
                 change = estimate.registry.register(lives, classes)
                 if 2 * len(change.added) <= len(estimate.active):
                     estimate.follow(change)
-                    settled, at = estimate.settle(WARM_ITERATIONS_MAX)
+                    settled, at = estimate.settle(WARM_ITERATIONS_MAX, WARM_ENOUGH)
                     if settled and len(estimate.active):
                         self._estimate = estimate
                         return _solution(estimate, at, lives, classes)

@@ -50,8 +50,8 @@ class Node:
     """See the rules above. `variables`: E ascending, then B ascending; `eliminated`: how many are E."""
 
     __slots__ = (
-        "D", "U", "W", "at", "axis", "children", "count", "counts", "eliminated", "parent", "pieces", "place", "reshape",
-        "rows", "stale", "variables",
+        "D", "U", "W", "at", "axis", "children", "count", "counts", "eliminated", "parent", "pieces", "place",
+        "reshape", "rows", "stale", "variables",
     )  # fmt: skip
 
     def __init__(self, parent: "Node | None") -> None:
@@ -219,7 +219,7 @@ class Tree:
         self._total = np.empty(0, np.int64)
         self._place = np.empty(0, np.int64)
         self._order: list[Node] = []
-        self._mode = 0.0, False
+        self._damping = 0.0
 
     def know(self, sizes: Sequence[int]) -> None:
         """More joint variables: two rows each, or three."""
@@ -338,18 +338,17 @@ class Tree:
             self._order = list(_postorder(self.root))
         return self._order
 
-    def factor(self, frames: Frames, at: Evaluation, damping: float = 0.0, *, curved: bool = False) -> int:
+    def factor(self, frames: Frames, at: Evaluation, damping: float = 0.0) -> int:
         """Bring D, W and U up to date, frames below stale nodes linearised at `at`. Returns how many nodes were redone.
 
-        damping: share by which the diagonal grows when a variable is eliminated. curved: the whole second derivative
-        instead of J' H_f J. A change of either makes all stale.
+        damping: share by which the diagonal grows when a variable is eliminated; a change of it makes all stale.
 
         Raises NumericalError where the matrix is not positive definite; whatever was stale is stale still.
         """
-        if (damping, curved) != self._mode:
+        if damping != self._damping:
             for node in self._nodes():
                 node.stale = True
-            self._mode = damping, curved
+            self._damping = damping
         stale = [node for node in self._nodes() if node.stale]
         for node in stale:
             if node.reshape:
@@ -387,9 +386,9 @@ class Tree:
             F = np.zeros((e + b, e + b))
             _rows_into(self._place, node.variables, self.size)
             own = np.array([self.pieces[number][:3] for number in node.pieces], np.int64).reshape(-1, 3)
-            add_pieces_into(F, frames, own, at, self._place, self._mode[1])
+            add_pieces_into(F, frames, own, at, self._place)
             D, W, U = F[:e, :e].copy(), F[:e, e:].copy(), F[e:, e:].copy()
-        _factored(D, W, U, self._mode[0])
+        _factored(D, W, U, self._damping)
         node.D, node.W, node.U = D, W, _packed(U)
 
     def solve(self, g: Floats) -> Floats:
@@ -428,13 +427,13 @@ def _selected(D: Floats, W: Floats, S_BB: Floats) -> Floats:
     if not e:
         return S_BB
     inverse, _ = _lapack.dpotri(D.T, lower=1)
-    S_EE = np.tril(inverse) + np.tril(inverse, -1).T
+    S_EE: Floats = np.tril(inverse) + np.tril(inverse, -1).T
     if not b:
         return S_EE
-    Y = _blas.dtrsm(1.0, D.T, W.T, side=1, lower=1)
+    Y: Floats = _blas.dtrsm(1.0, D.T, W.T, side=1, lower=1)
     S_BE = -S_BB @ Y
     S_EE -= Y.T @ S_BE
-    return np.block([[(S_EE + S_EE.T) / 2, S_BE.T], [S_BE, S_BB]])
+    return np.asarray(np.block([[(S_EE + S_EE.T) / 2, S_BE.T], [S_BE, S_BB]]))
 
 
 def _postorder(node: Node) -> Iterator[Node]:
