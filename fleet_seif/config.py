@@ -90,7 +90,6 @@ class FusionSettings(Settings):
     ack_every: messages folded before an acknowledgement is sent at once; ack_s: otherwise after this time.
     map_s: least time between two served maps.
     stalled_s: silence after which a vehicle counts as stalled.
-    covariance_landmarks_max: live maps above this size carry no covariances (the final one always does).
     """
 
     parked_max: Annotated[int, Field(ge=1, le=1_000_000)] = 4096
@@ -110,4 +109,3 @@ class FusionSettings(Settings):
     ack_s: Positive = 0.05
     map_s: Positive = 0.2
     stalled_s: Positive = 3.0
-    covariance_landmarks_max: Annotated[int, Field(ge=0)] = 400

@@ -98,9 +98,9 @@ class Names:
 def checked_reading(
     odometry: Floats, odometry_cov: Floats, seen: Sightings
 ) -> tuple[Floats, Floats, Floats, Floats, Ints]:
-    """The arrays of a reading in the one layout that kernels are compiled for. Raises ReadingRefused for shapes."""
+    """A reading's arrays, copied into the one layout that kernels are compiled for. Raises ReadingRefused."""
     u, cov, z, Z = (np.array(array, np.float64, order="C") for array in (odometry, odometry_cov, seen.z, seen.cov))
-    signature = np.asarray(seen.signature)
+    signature = np.array(seen.signature)
     if signature.ndim != 1 or (len(signature) and signature.dtype.kind not in "iu"):
         raise ReadingRefused("reading refused: signatures must be a flat array of integers")
     count = len(signature)

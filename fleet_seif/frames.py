@@ -11,7 +11,6 @@
 6. With frames = "single" there is one, which closes at the end and is never corrected.
 """
 
-import dataclasses
 import logging
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,14 +22,14 @@ from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.errors import NumericalError
 from fleet_seif.filters import Names, StepResult
 from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
-from fleet_seif.frame_deltas import quantised, renumbered
+from fleet_seif.frame_deltas import quantised
 from fleet_seif.geometry import act_all, compose
 from fleet_seif.information import FrameDelta, FrameTotal
-from fleet_seif.joint import JointSolution, Life, landmark_names, solve
+from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_names, one_thread
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Ints, Reading, Sightings
-from fleet_seif.seif import Seif
+from fleet_seif.seif import Seif, Taken
 
 log = logging.getLogger(__name__)
 FRAME_LANDMARKS_MAX = 4096
@@ -41,71 +40,82 @@ LOCALISE_STEPS = 5
 
 @dataclass
 class FrameLog:
-    """The readings of one frame, and the live estimate after each: what its batch is made from."""
+    """The readings of one frame, and the live estimate after each: what its batch is made from.
 
-    odometry: list[Floats] = field(default_factory=list)
-    odometry_cov: list[Floats] = field(default_factory=list)
-    poses: list[Floats] = field(default_factory=list)
+    motions: odometry, its covariance, and the pose after it. sightings: the number of motions before, signatures, z and
+    their covariances.
+    """
+
+    motions: list[tuple[Floats, Floats, Floats]] = field(default_factory=list)
     sightings: list[tuple[int, Ints, Floats, Floats]] = field(default_factory=list)
     heading_variance: float = 0.0
 
-    def add(self, reading: Reading | None, seen: Sightings, numbers: Ints, pose: Floats) -> None:
-        """One step: the motion (none before any), and what was seen, by the frame's own landmark numbers."""
-        if reading is not None:
-            self.odometry.append(np.array(reading.odometry, float))
-            self.odometry_cov.append(np.array(reading.odometry_cov, float))
-            self.poses.append(pose)
-            self.heading_variance += float(reading.odometry_cov[2, 2])
-        if len(numbers):
-            self.sightings.append((len(self.odometry), numbers, np.array(seen.z, float), np.array(seen.cov, float)))
+    def add(self, moves: bool, taken: Taken, pose: Floats) -> None:
+        """One step: the motion (none before any), and what was seen. The arrays are kept."""
+        u, cov, z, Z, signature = taken
+        if moves:
+            self.motions.append((u, cov, pose))
+            self.heading_variance += float(cov[2, 2])
+        if len(signature):
+            self.sightings.append((len(self.motions), signature, z, Z))
 
     def state(self) -> tuple[Any, ...]:
         """Plain values for msgpack; `restored` takes them back."""
-        seen = [(step, numbers.tobytes(), z.tobytes(), Z.tobytes()) for step, numbers, z, Z in self.sightings]
-        motion = [np.array(each).tobytes() for each in (self.odometry, self.odometry_cov, self.poses)]
-        return (*motion, seen, self.heading_variance)
+        seen = [
+            (step, names.astype(np.int64).tobytes(), z.tobytes(), Z.tobytes()) for step, names, z, Z in self.sightings
+        ]
+        motions = [tuple(array.tobytes() for array in motion) for motion in self.motions]
+        return motions, seen, self.heading_variance
 
     @staticmethod
     def restored(state: tuple[Any, ...]) -> "FrameLog":
-        u, cov, poses, seen, heading_variance = state
+        motions, seen, heading_variance = state
         return FrameLog(
-            odometry=list(np.frombuffer(u).reshape(-1, 3)),
-            odometry_cov=list(np.frombuffer(cov).reshape(-1, 3, 3)),
-            poses=list(np.frombuffer(poses).reshape(-1, 3)),
+            motions=[
+                (np.frombuffer(u), np.frombuffer(cov).reshape(3, 3), np.frombuffer(pose)) for u, cov, pose in motions
+            ],
             sightings=[
                 (
-                    step, np.frombuffer(numbers, np.int64), np.frombuffer(z).reshape(-1, 2),
+                    step, np.frombuffer(names, np.int64), np.frombuffer(z).reshape(-1, 2),
                     np.frombuffer(Z).reshape(-1, 2, 2),
                 )
-                for step, numbers, z, Z in seen
+                for step, names, z, Z in seen
             ],
             heading_variance=heading_variance,
         )  # fmt: skip
 
-    def solved(self, model: int, landmarks: Floats) -> FrameSolution:
-        """The batch over these readings, from the live estimates on. Raises NumericalError."""
-        steps = [np.full(len(numbers), step) for step, numbers, _, _ in self.sightings]
-        none = Sightings.none()
+    def solved(self, model: int, signatures: Ints, landmarks: Floats) -> FrameSolution:
+        """The batch over these readings, from the live estimates on; signatures of its landmarks (n,), m (n, 2).
+
+        Raises NumericalError.
+        """
+        steps = [np.full(len(names), step) for step, names, _, _ in self.sightings]
+        none, order = Sightings.none(), np.argsort(signatures)
+        seen = np.concatenate([*(names for _, names, _, _ in self.sightings), none.signature]).astype(np.int64)
         readings = FrameReadings(
             model=model,
-            odometry=np.array(self.odometry).reshape(-1, 3),
-            odometry_cov=np.array(self.odometry_cov).reshape(-1, 3, 3),
+            odometry=np.array([u for u, _, _ in self.motions]).reshape(-1, 3),
+            odometry_cov=np.array([cov for _, cov, _ in self.motions]).reshape(-1, 3, 3),
             step=np.concatenate([*steps, none.signature]).astype(np.int64),
-            landmark=np.concatenate([*(numbers for _, numbers, _, _ in self.sightings), none.signature]),
+            landmark=order[np.searchsorted(signatures, seen, sorter=order)],
             z=np.concatenate([*(z for _, _, z, _ in self.sightings), none.z]),
             cov=np.concatenate([*(Z for _, _, _, Z in self.sightings), none.cov]),
         )
-        return solve_frame(readings, np.array(self.poses).reshape(-1, 3), landmarks)
+        return solve_frame(readings, np.array([pose for _, _, pose in self.motions]).reshape(-1, 3), landmarks)
 
 
 @dataclass
 class Closed:
-    """A frame that has ended and is to be corrected at step `due`. landmarks: as estimated last; numbers: names."""
+    """A frame that has ended and is to be corrected at step `due`.
+
+    landmarks (n, 2): as estimated last; signatures, numbers (n,): theirs, and how they are called in the life.
+    """
 
     frame: int
     due: int
     log: FrameLog
     landmarks: Floats
+    signatures: Ints
     numbers: Ints
 
 
@@ -115,13 +125,14 @@ class FramedFilter:
     def __init__(self, settings: FilterSettings, model: int = RANGE_BEARING) -> None:
         self.settings = settings
         self.model = model
-        self.names = Names()
         self.steps = 0
         self.totals: list[FrameTotal] = []
         self.ends: list[Floats] = []
+        self._solver = JointSolver()
         self._origin = 0, np.zeros(3)
         self._map = np.empty((0, 2))
         self._localised = self._asked = 0
+        self._names = Names()
         self._single = settings.frames == "single"
         self._frame_settings = settings
         if not self._single:
@@ -132,16 +143,14 @@ class FramedFilter:
 
     def _open(self) -> None:
         """Begin a frame; it is published with its first step."""
-        self.filter = Seif(self._frame_settings, self.model)
-        self._numbers: list[int] = []
+        self.filter = Seif(self._frame_settings, self.model, None if self._single else self._names)
         self._log = FrameLog()
         self._opened = False
-        self.totals.append(FrameTotal())
 
     @property
     def signatures(self) -> list[int]:
         """Signatures of the life's landmarks by number."""
-        return self.names.signatures
+        return self.filter.signatures if self._single else self._names.signatures
 
     @property
     def pose(self) -> Floats:
@@ -163,7 +172,7 @@ class FramedFilter:
             return self.filter.landmarks
         found = np.full((len(self.signatures), 2), np.nan)
         found[: len(self._map)] = self._map
-        own = np.array(self._numbers, np.int64)
+        own = self.filter.called
         new = np.isnan(found[own, 0])
         found[own[new]] = act_all(self._open_pose, self.filter.landmarks[new])
         return found
@@ -187,10 +196,11 @@ class FramedFilter:
             signatures=tuple(self.signatures),
         )  # fmt: skip
 
+    @one_thread
     def solve_own(self, life: Life) -> JointSolution | None:
         """The joint solution of `own_life`; None where there is none."""
         try:
-            return solve([life], tuple((name,) for name in landmark_names(life)))
+            return self._solver.update([life], tuple((name,) for name in landmark_names(life)))
         except NumericalError as error:
             log.warning("not_localised reason=%s", error)
             return None
@@ -212,27 +222,20 @@ class FramedFilter:
 
     def start(self, sightings: Sightings) -> tuple[StepResult, tuple[FramePart, ...]]:
         """What is seen before any motion: the first part of frame 0. Parts are what to publish."""
-        return self._take(None, sightings, self.filter.start(sightings))
+        return self._take(False, self.filter.start(sightings))
 
     def step(self, reading: Reading) -> tuple[StepResult, tuple[FramePart, ...]]:
         """One reading. Raises what Seif.step raises; nothing has changed then."""
         result = self.filter.step(reading)
         self.steps += 1
-        return self._take(reading, reading.sightings, result)
+        return self._take(True, result)
 
-    def _take(
-        self, reading: Reading | None, seen: Sightings, result: StepResult
-    ) -> tuple[StepResult, tuple[FramePart, ...]]:
-        if self._single:
-            self.names.add(list(result.new))
-        else:
-            result = self._named(result)
-            self._log.add(reading, seen, self.filter.numbers_of(seen), self.filter.pose)
+    def _take(self, moves: bool, result: StepResult) -> tuple[StepResult, tuple[FramePart, ...]]:
         frame, status = self.frame, FrameStatus.CONTINUED if self._opened else FrameStatus.OPENED
         self._opened = True
         if self._single:
             return result, (FramePart(frame=frame, status=status, delta=result.delta),)
-        self.totals[-1].add(result.delta)
+        self._log.add(moves, self.filter.taken, self.filter.pose)
         if not self._is_over():
             parts = [FramePart(frame=frame, status=status, delta=result.delta)]
         elif status is FrameStatus.CONTINUED:
@@ -247,32 +250,23 @@ class FramedFilter:
             parts += self._correction(self._closed.pop(0))
         return result, tuple(parts)
 
-    def _named(self, result: StepResult) -> StepResult:
-        """A step's result by the life's landmark numbers."""
-        first_new, new = len(self.names.signatures), []
-        for signature in result.new:
-            numbers, unknown = self.names.numbers(np.array([signature]))
-            new += unknown
-            self._numbers.append(int(numbers[0]))
-            self.names.add(unknown)
-        delta = renumbered(result.delta, np.array(self._numbers, np.int64))
-        return dataclasses.replace(result, delta=delta, first_new=first_new, new=tuple(new))
-
     def _is_over(self) -> bool:
-        settings, log = self.settings, self._log
+        settings, readings = self.settings, self._log
         return (
-            len(log.odometry) >= settings.frame_steps_max
-            or len(self._numbers) >= settings.frame_landmarks_max
-            or log.heading_variance >= settings.frame_heading_std_max_rad**2
+            len(readings.motions) >= settings.frame_steps_max
+            or len(self.filter.called) >= settings.frame_landmarks_max
+            or readings.heading_variance >= settings.frame_heading_std_max_rad**2
         )
 
     def _close(self) -> Floats:
         """End the open frame where it is now, so that the next step begins another; its last pose."""
         end_pose = self.filter.pose
         due = self.steps + self.settings.close_lag_steps
-        self._closed.append(
-            Closed(self.frame, due, self._log, self.filter.landmarks, np.array(self._numbers, np.int64))
-        )
+        live = self.filter
+        signatures = np.array(live.signatures, np.int64)
+        self._closed.append(Closed(self.frame, due, self._log, live.landmarks, signatures, live.called))
+        self.totals.append(FrameTotal())
+        self.totals[-1].add(live.published())
         self.ends.append(end_pose)
         self._open()
         return end_pose
@@ -281,7 +275,7 @@ class FramedFilter:
         """What the batch over a closed frame changes, to be published; nothing where it fails."""
         total = self.totals[closed.frame]
         try:
-            batch = closed.log.solved(self.model, closed.landmarks)
+            batch = closed.log.solved(self.model, closed.signatures, closed.landmarks)
             order = np.argsort(closed.numbers)
             order = order[batch.seen[order]]
             rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
@@ -318,32 +312,33 @@ class FramedFilter:
         if self._single:
             return state
         closed = [
-            (each.frame, each.due, each.log.state(), each.landmarks.tobytes(), each.numbers.tobytes())
+            (
+                each.frame, each.due, each.log.state(), each.landmarks.tobytes(), each.signatures.tobytes(),
+                each.numbers.tobytes(),
+            )
             for each in self._closed
-        ]
+        ]  # fmt: skip
         return {
-            **state, "numbers": self._numbers, "signatures": self.signatures, "log": self._log.state(),
-            "closed": closed, "totals": [pack_delta(total.delta()) for total in self.totals],
-            "ends": np.array(self.ends).tobytes(),
+            **state, "signatures": self.signatures, "log": self._log.state(), "closed": closed,
+            "totals": [pack_delta(total.delta()) for total in self.totals], "ends": np.array(self.ends).tobytes(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on where `state` was taken, to the bit. Raises ValueError where it is not the state of a filter."""
+        if not self._single:
+            self._names.add(list(state["signatures"]))
         self.filter.restore(state["filter"])
         self.steps, self._opened = state["steps"], state["opened"]
-        self._origin, self._localised = (0, np.zeros(3)), self.steps - LOCALISE_STEPS
-        self.names = Names()
         if self._single:
-            self.names.add(self.filter.signatures)
             return
-        self.names.add(list(state["signatures"]))
-        self._numbers, self._log = list(state["numbers"]), FrameLog.restored(state["log"])
+        self._localised = self.steps - LOCALISE_STEPS
+        self._log = FrameLog.restored(state["log"])
         self._closed = [
             Closed(
                 frame, due, FrameLog.restored(log), np.frombuffer(landmarks).reshape(-1, 2),
-                np.frombuffer(numbers, np.int64),
+                np.frombuffer(signatures, np.int64), np.frombuffer(numbers, np.int64),
             )
-            for frame, due, log, landmarks, numbers in state["closed"]
+            for frame, due, log, landmarks, signatures, numbers in state["closed"]
         ]  # fmt: skip
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
@@ -352,6 +347,5 @@ class FramedFilter:
 
     def published(self) -> tuple[FrameDelta, ...]:
         """The sum of all that has been published, frame by frame."""
-        if self._single:
-            return (self.filter.published(),) if self._opened else ()
-        return tuple(total.delta() for total in (self.totals if self._opened else self.totals[:-1]))
+        closed = tuple(total.delta() for total in self.totals)
+        return (*closed, self.filter.published()) if self._opened else closed

@@ -18,6 +18,7 @@ from fleet_seif import seif_step as kernels
 from fleet_seif.config import FilterSettings
 from fleet_seif.errors import NumericalError, ReadingRefused
 from fleet_seif.filters import Names, StepResult, checked_reading
+from fleet_seif.frame_deltas import renumbered
 from fleet_seif.information import QUANTA_MAX, FrameDelta, quanta
 from fleet_seif.local_updates import KL, NORMALISED, RAW
 from fleet_seif.models import RANGE_BEARING
@@ -34,14 +35,24 @@ FAULTS = {
 _KINDS = {"seif": kernels.SEIF, "eif": kernels.EIF, "eseif": kernels.ESEIF}
 _STRENGTHS = {"normalised": NORMALISED, "raw": RAW, "kl": KL}
 
+Taken = tuple[Floats, Floats, Floats, Floats, Ints]
+
 
 class Seif:
-    """See the rules above. `model` is one of fleet_seif.models."""
+    """See the rules above.
 
-    def __init__(self, settings: FilterSettings, model: int = RANGE_BEARING) -> None:
+    Args:
+        model: one of fleet_seif.models. life: numbers of landmarks in what is published, where they are not the
+            filter's own; they, `first_new` and `new` are then those of the life.
+    """
+
+    def __init__(self, settings: FilterSettings, model: int = RANGE_BEARING, life: Names | None = None) -> None:
         self.settings = settings
         self.model = model
         self._names = Names()
+        self._life = life
+        self.called = np.empty(0, np.int64)
+        self.taken: Taken = (np.zeros(3), np.eye(3), np.empty((0, 2)), np.empty((0, 2, 2)), self.called)
         self._options = (
             _KINDS[settings.kind], settings.active_max, _STRENGTHS[settings.strength], settings.soften,
             settings.relax_others, settings.gate, settings.gate_patience, settings.neighbours_max,
@@ -115,19 +126,29 @@ class Seif:
             self._grow(2 * len(self._s.H_link) + block * block)
         if not moves:
             most += quanta(self.settings.start_information)
+        called, unknown = self.called, new
+        if self._life is not None:
+            first_new = len(self._life.signatures)
+            if new:
+                more, unknown = self._life.numbers(np.array(new))
+                called = np.concatenate([called, more])
         code, statistics, variables, rows, cols, H, b = kernels.seif_step(
-            self._floats, self._ints, self.model, moves, u, cov, numbers, z, Z, *self._options, most
+            self._floats, self._ints, self.model, moves, u, cov, numbers, z, Z, *self._options, most, called
         )
         if code != kernels.OK:
             self._refuse(code, u, z)
         if new:
             self._names.add(new)
+            if self._life is not None:
+                self._life.add(unknown)
+                self.called = called
         if self.settings.mean == "exact":
             self.recover()
+        self.taken = u, cov, z, Z, signature
         innovation, used, refused = statistics.tolist()
         return StepResult(
             FrameDelta(variables=variables, rows=rows, cols=cols, H=H, b=b),
-            first_new, tuple(new), innovation, int(used), int(refused), int(self._s.counts[ACTIVE]),
+            first_new, tuple(unknown), innovation, int(used), int(refused), int(self._s.counts[ACTIVE]),
         )  # fmt: skip
 
     def _refuse(self, code: int, u: Floats, z: Floats) -> None:
@@ -159,7 +180,8 @@ class Seif:
     def published(self) -> FrameDelta:
         """The sum of all deltas so far, as one."""
         variables, rows, cols, H, b = kernels.published_total(self._s)
-        return FrameDelta(variables=variables, rows=rows, cols=cols, H=H, b=b)
+        delta = FrameDelta(variables=variables, rows=rows, cols=cols, H=H, b=b)
+        return delta if self._life is None else renumbered(delta, self.called)
 
     def state(self) -> dict[str, Any]:
         """All that the filter knows, as plain values for msgpack; `restore` takes it back."""
@@ -178,6 +200,8 @@ class Seif:
         }
         seif_arrays.put_back(self._s, parts)
         self._names.add(list(state["signatures"]))
+        if self._life is not None:
+            self.called = self._life.numbers(np.array(self.signatures, np.int64))[0]
 
     def information(self) -> tuple[scipy.sparse.csc_array, Floats]:
         """The filter's own H (n, n) and b (n,): pose first, then landmarks by number."""

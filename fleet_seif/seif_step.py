@@ -317,23 +317,27 @@ def quantise(H: Floats, b: Floats, mu: Floats, entries: Ints) -> tuple[Ints, Int
 
 
 @kernel
-def block_delta(ids: Ints, q_H: Ints, q_b: Ints, old_H: Ints, old_b: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
-    """What changed in a block: the arrays of a FrameDelta, blocks and variables that did not change left out."""
-    m = len(ids) + 1
+def block_delta(names: Ints, q_H: Ints, q_b: Ints, old_H: Ints, old_b: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
+    """What changed in a block: the arrays of a FrameDelta, blocks and variables that did not change left out.
+
+    names (m,): what the landmarks of the block are called there, in its order. Of H, upper triangles.
+    """
+    m = len(names) + 1
     pairs = m * (m + 1) // 2
     rows, cols, H = np.empty(pairs, np.int64), np.empty(pairs, np.int64), np.empty(6 * pairs, np.int64)
-    used = np.zeros(m, np.bool_)
+    used, order, at = np.zeros(m, np.bool_), np.argsort(names), np.zeros(m, np.int64)
+    for v in range(1, m):
+        at[v] = 3 + 2 * order[v - 1]
     blocks = h = 0
     for v in range(m):
-        r0, r1 = (0, 3) if v == 0 else (1 + 2 * v, 3 + 2 * v)
-        for r in range(r0, r1):
+        r0, size_r = at[v], 3 if v == 0 else 2
+        for r in range(r0, r0 + size_r):
             used[v] |= q_b[r] != old_b[r]
         for w in range(v, m):
-            c0, c1 = (0, 3) if w == 0 else (1 + 2 * w, 3 + 2 * w)
-            changed, start = False, h
-            for r in range(r0, r1):
-                for c in range(r if v == w else c0, c1):
-                    H[h] = q_H[r, c] - old_H[r, c]
+            c0, size_c, changed, start = at[w], 3 if w == 0 else 2, False, h
+            for r in range(r0, r0 + size_r):
+                for c in range(r if v == w else c0, c0 + size_c):
+                    H[h] = q_H[r, c] - old_H[r, c] if r <= c else q_H[c, r] - old_H[c, r]
                     changed |= H[h] != 0
                     h += 1
             if changed:
@@ -346,10 +350,10 @@ def block_delta(ids: Ints, q_H: Ints, q_b: Ints, old_H: Ints, old_b: Ints) -> tu
     n = size = 0
     for v in range(m):
         if used[v]:
-            variables[n] = 0 if v == 0 else ids[v - 1] + 1
+            variables[n] = 0 if v == 0 else names[order[v - 1]] + 1
             position[v] = n
             n += 1
-            for r in range(0 if v == 0 else 1 + 2 * v, 3 + 2 * v):
+            for r in range(at[v], at[v] + (3 if v == 0 else 2)):
                 b[size] = q_b[r] - old_b[r]
                 size += 1
     for k in range(blocks):
@@ -593,12 +597,13 @@ def sparsify_block(H: Floats, b: Floats, mu: Floats, active_max: int, measure: i
 def seif_step(
     floats: Floats, ints: Ints, model: int, moves: bool, u: Floats, cov: Floats, sighted: Ints, z: Floats, Z: Floats,
     kind: int, active_max: int, measure: int, soften: float, others: int, gate: float, patience: int,
-    neighbours_max: int, growth_max: int,
+    neighbours_max: int, growth_max: int, called: Ints,
 ) -> tuple[int, Floats, Ints, Ints, Ints, Ints, Ints]:  # fmt: skip
     """One step: motion (if `moves`), sightings of landmarks `sighted`, mean recovery, sparsification, delta.
 
     Landmark numbers from counts[LANDMARKS] on are new; capacities must suffice. growth_max: quanta by which a diagonal
-    entry of H may grow at most. The other settings are those of FilterSettings.
+    entry of H may grow at most. called: what each landmark is called in the delta; empty: its number. The other
+    settings are those of FilterSettings.
 
     Returns: a code (OK ...), statistics (sum of squared innovations, sightings they come from, sightings refused), and
     the arrays of the FrameDelta.
@@ -663,7 +668,8 @@ def seif_step(
             s.counts[LANDMARKS] = ids[i] + 1
         s.refusals[ids[i]] = refusals[i]
     connect(s, ids, H, links)
-    variables, rows, cols, values, b_values = block_delta(ids, q_H, q_b, old_H, old_b)
+    names = called[ids] if len(called) > 0 else ids
+    variables, rows, cols, values, b_values = block_delta(names, q_H, q_b, old_H, old_b)
     scatter(s, ids, links, H, b, mu, q_H, q_b)
     if others > 0:
         enqueue_around(s, ids, known, mu, before)

@@ -2,17 +2,23 @@
 
 import contextlib
 import dataclasses
-from dataclasses import dataclass
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet_seif.config import FusionSettings
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import Life, marginal_covariances, solve
+from fleet_seif.joint import JointSolver, Life, marginal_covariances, one_thread, solve
 from fleet_seif.messages import JointMap, LandmarkName, VehicleState
+from fleet_seif.records import Floats
 from fusion.core import FusionCore
 
 LEFT_OUT = "lives_left_out"
+WEIGHTED_DOWN = "frames_weighted_down"
+COVARIANCE_PAUSE = 4.0
+"""Time between two computations of covariances, in the time that one takes."""
 Classes = tuple[tuple[LandmarkName, ...], ...]
 
 
@@ -30,6 +36,18 @@ class MapInput:
     ledger_digest: bytes
     vehicles: tuple[VehicleState, ...]
     counters: dict[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Covariances:
+    """Those of landmarks (n, 2, 2), m^2, and newest poses (v, 3, 3), with what they belong to. due_s: when anew."""
+
+    version: int = -1
+    classes: Classes = ()
+    poses: tuple[str, ...] = ()
+    landmark_cov: Floats = field(default_factory=lambda: np.empty((0, 2, 2)))
+    pose_cov: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
+    due_s: float = -math.inf
 
 
 def map_input(core: FusionCore, now_s: float) -> MapInput:
@@ -51,22 +69,91 @@ def map_input(core: FusionCore, now_s: float) -> MapInput:
     )
 
 
-def make_map(taken: MapInput, version: int, settings: FusionSettings, *, final: bool) -> JointMap:
-    """Solve: everything folded if that is positive definite, what has been checked otherwise and at the end."""
-    canonical = taken.live is None or final
-    if taken.live is not None and not final:
+class MapMaker:
+    """Makes the maps of a node, one after the other.
+
+    1. A map goes on from the one before (fleet_seif.joint_solver). A final one, a first one, and one that is asked for
+       as a `replay` is solved from nothing; if it rests on checked prefixes it is canonical.
+    2. Covariances have a cadence of their own: a map has them unless that would take more than a fifth of the time. In
+       between it carries the last ones as long as it has the same landmarks, with the version they belong to.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._solver = JointSolver()
+        self._covariances = Covariances()
+        self._is_first = True
+
+    def make(self, taken: MapInput, version: int, *, final: bool, replay: bool = False) -> JointMap:
+        """Solve: everything folded if that is positive definite, what has been checked otherwise and at the end.
+
+        Raises NumericalError where nothing can be solved.
+        """
+        canonical = taken.live is None or final
+        if taken.live is not None and not final:
+            try:
+                return self._solved(taken, taken.live, taken.live_classes, version, final=False, canonical=False)
+            except NumericalError:
+                canonical = replay = True
+        canonical = canonical and (replay or final or self._is_first)
         try:
-            return _solved(taken, taken.live, taken.live_classes, version, settings, final=False, canonical=False)
+            return self._solved(taken, taken.checked, taken.classes, version, final=final, canonical=canonical)
         except NumericalError:
-            canonical = True
-    try:
-        return _solved(taken, taken.checked, taken.classes, version, settings, final=final, canonical=canonical)
-    except NumericalError:
-        # each positive definite, and yet too lopsided or contradictory to be solved: nobody takes the map from all
-        good = _that_can_be_solved(taken.checked, taken.classes)
-        taken = dataclasses.replace(taken, counters={**taken.counters, LEFT_OUT: len(taken.checked) - len(good)})
-        kept = _classes_of(good, taken.classes)
-        return _solved(taken, good, kept, version, settings, final=final, canonical=canonical)
+            # each positive definite, and yet too lopsided or contradictory to be solved: nobody takes the map from all
+            good = _that_can_be_solved(taken.checked, taken.classes)
+            taken = dataclasses.replace(taken, counters={**taken.counters, LEFT_OUT: len(taken.checked) - len(good)})
+            kept = _classes_of(good, taken.classes)
+            return self._solved(taken, good, kept, version, final=final, canonical=canonical)
+
+    @one_thread
+    def _solved(
+        self, taken: MapInput, lives: tuple[Life, ...], classes: Classes, version: int, *, final: bool, canonical: bool
+    ) -> JointMap:
+        if not lives:  # nothing yet, but who has been heard and what has been counted
+            return dataclasses.replace(
+                empty_map(taken.fleet, taken.node, version), canonical=canonical, final=final,
+                map_digest=taken.map_digest, ledger_digest=taken.ledger_digest, vehicles=taken.vehicles,
+                counters=taken.counters,
+            )  # fmt: skip
+        solution = self._solver.replay(lives, classes) if canonical else self._solver.update(lives, classes)
+        self._is_first = False
+        newest = {vehicle: i for i, (vehicle, _, k) in enumerate(solution.poses) if k < 0}  # of several lives, the last
+        rows = list(newest.values())
+        covariances = self._covariances
+        if final or self._clock() >= covariances.due_s:
+            begin = self._clock()
+            landmarks, poses = marginal_covariances(solution)
+            spent = self._clock() - begin
+            due_s = self._clock() + COVARIANCE_PAUSE * spent
+            covariances = Covariances(version, classes, tuple(newest), landmarks, poses[rows], due_s)
+            self._covariances = covariances
+        elif (covariances.classes, covariances.poses) != (classes, tuple(newest)):
+            covariances = Covariances()
+        doubtful = int(np.count_nonzero(solution.weight < 1.0))
+        return JointMap(
+            fleet=taken.fleet,
+            node=taken.node,
+            version=version,
+            canonical=canonical,
+            final=final,
+            map_digest=taken.map_digest,
+            ledger_digest=taken.ledger_digest,
+            landmark_mean=solution.landmark_mean,
+            landmark_cov=covariances.landmark_cov,
+            cov_version=covariances.version,
+            names=classes,
+            signature=solution.signatures,
+            poses=tuple(newest),
+            pose_mean=solution.pose_mean[rows],
+            pose_cov=covariances.pose_cov,
+            vehicles=taken.vehicles,
+            counters={**taken.counters, WEIGHTED_DOWN: doubtful} if doubtful else taken.counters,
+        )
+
+
+def make_map(taken: MapInput, version: int, *, final: bool) -> JointMap:
+    """One map, from nothing. Raises NumericalError where nothing can be solved."""
+    return MapMaker().make(taken, version, final=final)
 
 
 def _that_can_be_solved(lives: tuple[Life, ...], classes: Classes) -> tuple[Life, ...]:
@@ -84,43 +171,6 @@ def _classes_of(lives: tuple[Life, ...], classes: Classes) -> Classes:
     names = {(life.vehicle, life.life) for life in lives}
     groups = (tuple(name for name in group if name[:2] in names) for group in classes)
     return tuple(sorted(group for group in groups if group))
-
-
-def _solved(
-    taken: MapInput, lives: tuple[Life, ...], classes: Classes, version: int, settings: FusionSettings,
-    *, final: bool, canonical: bool,
-) -> JointMap:  # fmt: skip
-    if not lives:  # nothing yet, but who has been heard and what has been counted
-        return dataclasses.replace(
-            empty_map(taken.fleet, taken.node, version), canonical=canonical, final=final, map_digest=taken.map_digest,
-            ledger_digest=taken.ledger_digest, vehicles=taken.vehicles, counters=taken.counters,
-        )  # fmt: skip
-    solution = solve(lives, classes)
-    poses = solution.poses
-    newest = {vehicle: i for i, (vehicle, _, k) in enumerate(poses) if k < 0}  # of several lives, the last
-    rows = list(newest.values())
-    with_cov = final or len(classes) <= settings.covariance_landmarks_max
-    if with_cov:
-        landmark_cov, pose_cov = marginal_covariances(solution)
-    return JointMap(
-        fleet=taken.fleet,
-        node=taken.node,
-        version=version,
-        canonical=canonical,
-        final=final,
-        map_digest=taken.map_digest,
-        ledger_digest=taken.ledger_digest,
-        landmark_mean=solution.landmark_mean,
-        landmark_cov=landmark_cov if with_cov else np.empty((0, 2, 2)),
-        cov_version=version if with_cov else -1,
-        names=classes,
-        signature=solution.signatures,
-        poses=tuple(newest),
-        pose_mean=solution.pose_mean[rows],
-        pose_cov=pose_cov[rows] if with_cov else np.empty((0, 3, 3)),
-        vehicles=taken.vehicles,
-        counters=taken.counters,
-    )
 
 
 def empty_map(fleet: str, node: str, version: int = -1) -> JointMap:

@@ -28,7 +28,7 @@ from fleet_seif.store import Put, Store, StoreError
 from fusion import records
 from fusion.core import AskEvents, AskRange, Effect, FusionCore, PutAck, PutStatus
 from fusion.inbox import Inbox
-from fusion.mapping import LEFT_OUT, empty_map, make_map, map_input
+from fusion.mapping import LEFT_OUT, WEIGHTED_DOWN, MapMaker, empty_map, map_input
 
 log = logging.getLogger(__name__)
 BURST_MAX = 256
@@ -106,6 +106,8 @@ class FusionService:
         self._alive: set[str] = set()
         self._changed_at_s: float | None = None
         self._served = b""
+        self._maker = MapMaker()
+        self._replayed = False
         self.newest: JointMap = empty_map(core.ledger.fleet, core.node, first_version - 1)
         self.statistics = Statistics()
         keys = self._keys
@@ -229,35 +231,41 @@ class FusionService:
         self._inbox.put(vehicle, lambda: self._core.on_reply_done(vehicle, epoch, self._clock()))
 
     def _solve_for_ever(self) -> None:
-        """Serve a map when there is news: something folded, or a vehicle that fell silent or came back."""
+        """Serve a map when there is news: something folded, or a vehicle that fell silent or came back. Where there is
+        none for once, the last one is solved from nothing, so that it is canonical."""
         while not self._over.wait(self._settings.map_s):
             try:
                 with self._lock:
                     stalled = [state.stalled for state in self._core.states(self._clock())]
                 old = self.newest
-                counted = {name: n for name, n in old.counters.items() if name != LEFT_OUT}
+                counted = {name: n for name, n in old.counters.items() if name not in (LEFT_OUT, WEIGHTED_DOWN)}
                 news = stalled != [state.stalled for state in old.vehicles] or self._core.counters != counted
                 if self._core.changed or news or not self._served:
                     self._serve(final=False)
+                elif not old.canonical and not self._replayed:
+                    self._serve(final=False, replay=True)
             except NumericalError as error:
                 log.error("map_not_solved reason=%s", error)
             except Exception:  # a fault of ours must not end the service of maps: the next one may be fine
                 log.exception("map_not_served")
 
-    def _serve(self, *, final: bool) -> None:
-        """Solve and publish the newest map. Raises NumericalError, the last one served, where it cannot be solved."""
+    def _serve(self, *, final: bool, replay: bool = False) -> None:
+        """Solve and publish the newest map; replay: from nothing, so that it is canonical.
+
+        Raises NumericalError, the last one served, where it cannot be solved.
+        """
         with self._lock:
             taken = map_input(self._core, self._clock())
             self._core.changed = False
             changed_at_s, self._changed_at_s = self._changed_at_s, None
         begin = time.perf_counter()
         try:
-            newest = make_map(taken, self.newest.version + 1, self._settings, final=final)
+            newest = self._maker.make(taken, self.newest.version + 1, final=final, replay=replay)
         except NumericalError:
             self._changed_at_s = changed_at_s
             raise
         self.statistics.solve_s.append(time.perf_counter() - begin)
-        self.newest = newest
+        self.newest, self._replayed = newest, replay
         self._served = encode_map(newest, self._signer)
         self._publish()
         self.statistics.maps += 1

@@ -170,7 +170,7 @@ class _Watcher:
         if not taken.checked:
             return
         try:
-            make_map(taken, 0, self.fleet.scenario.fusion, final=False)
+            make_map(taken, 0, final=False)
         except NumericalError as error:
             raise ChaosError(f"{node.name} could serve no map: {error}") from None
 

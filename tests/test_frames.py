@@ -58,7 +58,7 @@ def driven(settings: FilterSettings) -> VehicleCore:
 
 
 def test_with_a_single_frame_every_step_goes_on_with_it_and_the_end_ends_it() -> None:
-    framed, said = run(FilterSettings(), LOG)
+    framed, said = run(FilterSettings(frames="single"), LOG)
     assert [part.status for parts in said for part in parts] == [
         FrameStatus.OPENED, *[FrameStatus.CONTINUED] * len(LOG.readings), FrameStatus.ENDED
     ]  # fmt: skip

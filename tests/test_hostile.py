@@ -843,7 +843,7 @@ def check_claims(draws: int) -> None:
         asked = [e for e in core.tick(0.1 * k) if isinstance(e, AskRange)]
         assert len(asked) <= len(VEHICLES)
     assert (core.ledger.contents(), core.ledger.map_digest()) == before
-    decode_map(encode_map(make_map(map_input(core, 0.0), 0, LIVELY, final=False)))
+    decode_map(encode_map(make_map(map_input(core, 0.0), 0, final=False)))
     for vehicle in VEHICLES:
         assert core.ledger.accept(encode_message(told(vehicle)[NEXT], SIGNERS[vehicle]), vehicle)[0] is Receipt.FOLDED
 
@@ -926,7 +926,7 @@ def test_counters_with_keys_of_two_types_are_refused() -> None:
 def test_a_heartbeat_cannot_make_maps_unreadable() -> None:
     core = node_with_the_honest()
     core.on_heartbeat("eve", encode_heartbeat(heartbeat("eve", 2**53)), 0.0)
-    decode_map(encode_map(make_map(map_input(core, 0.0), 0, LIVELY, final=False)))
+    decode_map(encode_map(make_map(map_input(core, 0.0), 0, final=False)))
 
 
 def test_many_epochs_with_gaps_of_one_vehicle_do_not_keep_another_from_being_repaired() -> None:
@@ -1016,7 +1016,7 @@ def test_a_life_that_cannot_be_solved_does_not_take_the_map_from_others(changes:
 def test_frames_of_next_to_nothing_do_not_take_the_map_from_others() -> None:
     """Two frames of a quantum each with the largest b: positive definite, and nobody can solve them."""
     core, much = node_with_the_honest(), 2**59
-    alone = make_map(map_input(core, 0.0), 0, LIVELY, final=True)
+    alone = make_map(map_input(core, 0.0), 0, final=True)
     least = {(0, 0): [1, 0, 0, 1, 0, 1], (1, 1): [1, 0, 1]}
     parts = (
         part(OPENED, delta_of({(0, 0): [1, 0, 0, 1, 0, 1]}, {0: [much] * 3})), part(ENDED, FrameDelta.nothing()),
@@ -1026,7 +1026,7 @@ def test_frames_of_next_to_nothing_do_not_take_the_map_from_others() -> None:
     assert give(core.ledger, "eve", encode_message(m)) is Receipt.FOLDED
     with pytest.raises(NumericalError):
         solve(core.ledger.lives(), core.ledger.classes(core.ledger.lives()))
-    joint = make_map(map_input(core, 0.0), 0, LIVELY, final=True)
+    joint = make_map(map_input(core, 0.0), 0, final=True)
     assert joint.counters["lives_left_out"] == 1
     assert (joint.names, joint.poses) == (alone.names, alone.poses)
     assert np.array_equal(joint.landmark_mean, alone.landmark_mean)
@@ -1042,7 +1042,7 @@ def test_a_start_pose_that_is_far_off_does_not_take_the_map_from_others() -> Non
         lied(1, 64, epoch=epoch, parts=(part(CONTINUED, seen(0)),), landmarks=((0, 70),)),
     ):
         assert give(core.ledger, "eve", encode_message(m)) is Receipt.FOLDED
-    joint = make_map(map_input(core, 0.0), 0, LIVELY, final=True)
+    joint = make_map(map_input(core, 0.0), 0, final=True)
     assert set(HONEST) <= set(joint.poses)
 
 

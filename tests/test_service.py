@@ -83,7 +83,7 @@ def test_a_vehicle_whose_information_is_indefinite_is_left_out_and_the_others_ar
         core.on_delta("good", data, 0.0)
     core.on_delta("bad", negated(stream("bad")[0]), 0.0)
     for final in (False, True):
-        joint = make_map(map_input(core, 0.0), 0, SETTINGS, final=final)
+        joint = make_map(map_input(core, 0.0), 0, final=final)
         assert (joint.poses, joint.canonical, joint.final) == (("good",), True, final)
         assert ["positive definite" in state.fault for state in joint.vehicles] == [True, False]
     assert core.complete
@@ -104,7 +104,7 @@ def test_a_live_map_holds_all_that_is_folded_and_the_final_one_what_has_been_che
     maps = []
     for data in longer("v1"):
         core.on_delta("v1", data, 0.0)
-        maps += [make_map(map_input(core, 0.0), 0, SETTINGS, final=final) for final in (False, True)]
+        maps += [make_map(map_input(core, 0.0), 0, final=final) for final in (False, True)]
     live, final = maps[0::2], maps[1::2]
     assert [joint.canonical for joint in live] == [True, False, False, False, False, True]
     assert all(joint.canonical for joint in final)
@@ -119,12 +119,12 @@ def test_where_the_live_map_cannot_be_solved_the_checked_one_is_served() -> None
     core = FusionCore("f", "node", SETTINGS)
     first, second = longer("v1")[:2]
     core.on_delta("v1", first, 0.0)
-    before = make_map(map_input(core, 0.0), 0, SETTINGS, final=False)
+    before = make_map(map_input(core, 0.0), 0, final=False)
     strong = decode_message(second).parts[0]
     spoiled = replace(strong, delta=replace(strong.delta, H=-(2**50) * np.ones_like(strong.delta.H)))
     core.on_delta("v1", encode_message(replace(decode_message(second), parts=(spoiled,))), 0.0)
     assert core.states(0.0)[0].fault == ""
-    joint = make_map(map_input(core, 0.0), 1, SETTINGS, final=False)
+    joint = make_map(map_input(core, 0.0), 1, final=False)
     assert joint.canonical
     assert np.array_equal(joint.landmark_mean, before.landmark_mean)
 
