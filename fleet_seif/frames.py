@@ -272,7 +272,9 @@ class FramedFilter:
         return end_pose
 
     def _correction(self, closed: Closed) -> list[FramePart]:
-        """What the batch over a closed frame changes, to be published; nothing where it fails."""
+        """What the batch over a closed frame changes, to be published; nothing where it fails, or nothing moved."""
+        if not closed.log.motions:
+            return []
         total = self.totals[closed.frame]
         try:
             batch = closed.log.solved(self.model, closed.signatures, closed.landmarks)
