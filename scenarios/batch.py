@@ -18,7 +18,7 @@ by Levenberg-Marquardt; rho is the square, or Huber's where asked. It knows whic
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -26,7 +26,6 @@ from typing import Any, Final
 
 import numpy as np
 import scipy.sparse
-import scipy.sparse.linalg
 
 from fleet_seif.errors import NumericalError, RunError
 from fleet_seif.geometry import between, between_jacobians, compose, wrap
@@ -46,7 +45,12 @@ STRIDE_MAX: Final = 25
 RELINEARIZE_RAD_OR_M: Final = 0.05
 SETTLING_UPDATES: Final = 3
 ITERATIONS_MAX: Final = 200
+FILTERING: Final = "first estimate, %"
+ITERATING: Final = "iterations"
+STAGES: Final = {FILTERING: 100, ITERATING: ITERATIONS_MAX}
+"""What `solve_batch` tells its progress of, with how much there is of each."""
 TOLERANCE: Final = 1e-9
+REMEDY: Final = "remedy: robust weights (--robust), or another start"
 POSE_KEYS: Final = 2**40
 """Keys from one vehicle to the next, above those of the landmarks."""
 
@@ -79,57 +83,35 @@ class BatchSolution:
     left_out: int
 
 
+def _untold(stage: str, done: int, total: int) -> None:
+    pass
+
+
 @one_thread
-def solve_batch(recording: Recording, *, robust: bool = False, start: Guess | None = None) -> BatchSolution:
+def solve_batch(
+    recording: Recording,
+    *,
+    robust: bool = False,
+    start: Guess | None = None,
+    progress: Callable[[str, int, int], None] = _untold,
+) -> BatchSolution:
     """The batch over all readings of a recording.
 
     Args:
         robust: weigh sightings by Huber's function: for readings with outliers, such as misread barcodes.
         start: where to begin instead of at what iSAM2 finds; it must hold every pose and every landmark.
+        progress: is called with one of STAGES, how far it is, and how far that goes at most.
 
     Raises:
         RunError: gtsam is not installed, there is nothing to solve, or `start` lacks something.
         NumericalError: no minimum was found.
     """
-    problem = _Problem(_gtsam(), recording, robust)
+    problem = _Problem(_gtsam(), recording, robust, progress)
     try:
         return problem.minimised(problem.filtered() if start is None else problem.at(start))
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
-        raise NumericalError(f"gtsam cannot solve the batch: {reason}; remedy: robust weights, or a start") from error
-
-
-def landmark_chi_square(H: scipy.sparse.csr_array, rows: Ints, error: Floats) -> float:
-    """d' P^-1 d with the joint covariance P of the chosen rows of a system with information H.
-
-    P^-1 is the Schur complement of all other variables: H_cc - H_co H_oo^-1 H_oc.
-
-    Args:
-        rows: which rows, ascending, shape (k,).
-        error: d, shape (k,).
-    """
-    other = np.setdiff1d(np.arange(H.shape[0]), rows)
-    value = float(error @ (H[rows][:, rows] @ error))
-    if len(other):
-        pulled = H[other][:, rows] @ error
-        value -= float(pulled @ _factor(H[other][:, other]).solve(pulled))
-    return value
-
-
-def landmark_covariance(solution: BatchSolution) -> Floats:
-    """The joint covariance of all landmarks, dense, m^2, shape (2n, 2n): for maps of up to a few thousand."""
-    n = solution.landmark_mean.size
-    H_ly = solution.H[:n][:, n:]
-    information = solution.H[:n][:, :n].toarray() - H_ly @ _factor(solution.H[n:][:, n:]).solve(H_ly.T.toarray())
-    covariance: Floats = np.linalg.inv((information + information.T) / 2)
-    return covariance
-
-
-def _factor(H: scipy.sparse.csr_array) -> Any:
-    options = {"SymmetricMode": True, "Equil": False}
-    return scipy.sparse.linalg.splu(
-        scipy.sparse.csc_matrix(H), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
-    )
+        raise NumericalError(f"gtsam cannot solve the batch: {reason}; {REMEDY}") from error
 
 
 def _gtsam() -> ModuleType:
@@ -142,8 +124,11 @@ def _gtsam() -> ModuleType:
 class _Problem:
     """The readings of a recording as factors of gtsam."""
 
-    def __init__(self, gtsam: ModuleType, recording: Recording, robust: bool) -> None:
+    def __init__(
+        self, gtsam: ModuleType, recording: Recording, robust: bool, progress: Callable[[str, int, int], None]
+    ) -> None:
         self._gtsam = gtsam
+        self._progress = progress
         self._logs = [_with_signatures(log) for log in recording.logs.values()]
         seen = [log.sighting_signature for log in self._logs]
         self._signatures: Ints = np.unique(np.concatenate(seen)) if seen else np.empty(0, np.int64)
@@ -156,7 +141,9 @@ class _Problem:
         """Values for all keys, from iSAM2 (rule 3)."""
         isam, known = self._isam(), set[int]()
         newest = [np.asarray(log.start_pose, float) for log in self._logs]
-        for spans in _strides(self._logs):
+        strides = list(_strides(self._logs))
+        for stride, spans in enumerate(strides):
+            self._progress(FILTERING, 100 * stride // len(strides), 100)
             factors, values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
             for vehicle, (low, high) in enumerate(spans):
                 pose, log = newest[vehicle], self._logs[vehicle]
@@ -173,6 +160,7 @@ class _Problem:
             for vehicle, (low, high) in enumerate(spans):
                 if low < high:
                     newest[vehicle] = _array(isam.calculateEstimatePose2(_pose_key(vehicle, high - 1)))
+        self._progress(FILTERING, 100, 100)
         for _ in range(SETTLING_UPDATES):
             isam.update()
         return isam.calculateEstimate()
@@ -208,10 +196,11 @@ class _Problem:
         parameters.setMaxIterations(ITERATIONS_MAX)
         parameters.setRelativeErrorTol(TOLERANCE)
         parameters.setAbsoluteErrorTol(TOLERANCE)
+        parameters.iterationHook = lambda done, before, after: self._progress(ITERATING, int(done), ITERATIONS_MAX)
         optimizer = self._gtsam.LevenbergMarquardtOptimizer(whole, values, parameters)
         found = optimizer.optimize()
         if optimizer.iterations() >= ITERATIONS_MAX:
-            raise NumericalError(f"the batch did not converge in {ITERATIONS_MAX} iterations")
+            raise NumericalError(f"the batch did not converge in {ITERATIONS_MAX} iterations; {REMEDY}")
         H, residuals = self._information(graph, found)
         return BatchSolution(
             signatures=self._signatures,
@@ -230,8 +219,11 @@ class _Problem:
     def _information(self, graph: Any, values: Any) -> tuple[scipy.sparse.csr_array, int]:
         """H = J' J of whitened factors at these values, without columns of given start poses; and the rows of J."""
         i, j, v = graph.linearize(values).sparseJacobian_()
-        J = scipy.sparse.csr_array((v, (i.astype(np.int64) - 1, j.astype(np.int64) - 1)))[:, :-1]  # the last is b
         at = 2 * len(self._signatures)
+        columns = at + sum(3 * (log.steps + 1) for log in self._logs)
+        J = scipy.sparse.csr_array(  # one column more: the right side
+            (v, (i.astype(np.int64) - 1, j.astype(np.int64) - 1)), shape=(int(i.max()), columns + 1)
+        )
         free = [np.arange(at)]
         for log in self._logs:
             free.append(np.arange(at + 3 * _is_given(log), at + 3 * (log.steps + 1)))

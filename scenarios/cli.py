@@ -19,6 +19,7 @@ from fleet_seif.messages import check_name
 from fleet_seif.warm_up import warm_up
 from scenarios import chaos_runs, children, output, tools, watch
 from scenarios.access import Kind
+from scenarios.batch import STAGES
 from scenarios.config import ScenarioError, load_scenario, shipped
 from scenarios.evaluate import read_run, score_run, score_table, score_with_batch
 from scenarios.experiments.names import EXPERIMENTS, find_experiment, run_experiment, summary_table
@@ -376,7 +377,11 @@ def evaluate_run(
 ) -> None:
     """Score a finished run against the truth: errors of maps and poses, NEES with its band, bytes a step."""
     stored = read_run(folder)
-    scored = score_with_batch(stored, robust=robust) if batch or robust else score_run(stored)
+    if batch or robust:
+        with progress_bars(errors, STAGES, quiet=False) as progress:
+            scored = score_with_batch(stored, robust=robust, progress=progress)
+    else:
+        scored = score_run(stored)
     if as_json:
         console.print_json(json.dumps(scored, allow_nan=False))
     else:

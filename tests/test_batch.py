@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from fleet_seif.errors import RunError
 from fleet_seif.geometry import between
+from fleet_seif.joint import marginal_chi_square
 from fleet_seif.records import Floats
 from scenarios import batch
-from scenarios.batch import BatchSolution, Guess, landmark_chi_square, landmark_covariance, solve_batch
+from scenarios.batch import BatchSolution, Guess, solve_batch
 from scenarios.recording import Log, Recording
 from scenarios.world import NoiseSettings, WorldSettings, simulate
 
@@ -99,6 +100,12 @@ def whitened(r: Floats, cov: Floats) -> Floats:
     return np.asarray(np.linalg.solve(np.linalg.cholesky(cov), r))
 
 
+def landmark_covariance(solution: BatchSolution) -> Floats:
+    """The joint covariance of all landmarks by a dense inverse, m^2, shape (2n, 2n)."""
+    n = solution.landmark_mean.size
+    return np.asarray(np.linalg.inv(solution.H.toarray())[:n, :n])
+
+
 def landmark_errors(solution: BatchSolution, recording: Recording) -> Floats:
     return np.asarray(solution.landmark_mean - recording.landmarks[solution.signatures]).ravel()
 
@@ -144,7 +151,7 @@ def test_chi_square_of_some_landmarks_is_that_of_their_joint_covariance() -> Non
     P = landmark_covariance(found)
     for rows in (np.arange(len(error)), np.array([2, 3, 8, 9])):
         expected = error[rows] @ np.linalg.solve(P[np.ix_(rows, rows)], error[rows])
-        assert landmark_chi_square(found.H, rows, error[rows]) == pytest.approx(expected, rel=1e-6)
+        assert marginal_chi_square(found.H, rows, error[rows]) == pytest.approx(expected, rel=1e-6)
 
 
 def test_its_errors_are_what_it_says_they_are() -> None:
@@ -154,7 +161,7 @@ def test_its_errors_are_what_it_says_they_are() -> None:
         recording = world(seed)
         found = solve_batch(recording)
         error = landmark_errors(found, recording)
-        total += landmark_chi_square(found.H, np.arange(len(error)), error)
+        total += marginal_chi_square(found.H, np.arange(len(error)), error)
         dof += len(error)
         assert found.chi_square / found.degrees_of_freedom == pytest.approx(1.0, abs=0.25)
     assert scipy.stats.chi2.ppf(0.005, dof) < total < scipy.stats.chi2.ppf(0.995, dof)
@@ -190,6 +197,15 @@ def test_the_minimum_does_not_depend_on_where_it_begins() -> None:
     again = solve_batch(recording, start=Guess(poses=poses, landmarks=landmarks))
     np.testing.assert_allclose(again.landmark_mean, found.landmark_mean, atol=1e-6)
     assert again.chi_square == pytest.approx(found.chi_square, rel=1e-7)
+
+
+def test_it_tells_how_far_it_is() -> None:
+    pytest.importorskip("gtsam")
+    told: list[tuple[str, int, int]] = []
+    found = solve_batch(world(1), progress=lambda *each: told.append(each))
+    assert [each for each in told if each[0] == batch.FILTERING][-1] == (batch.FILTERING, 100, 100)
+    assert [each for each in told if each[0] == batch.ITERATING][-1][1] == found.iterations
+    assert all(batch.STAGES[stage] == total >= done >= 0 for stage, done, total in told)
 
 
 def test_a_start_that_lacks_something_is_refused() -> None:
