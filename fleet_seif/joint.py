@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar, cast
 
 import numpy as np
+import scipy.sparse
 import threadpoolctl
 from numpy.typing import NDArray
 
@@ -30,11 +31,11 @@ from fleet_seif.joint_records import Classes, JointSolution, Life
 from fleet_seif.joint_solver import JointSolver
 from fleet_seif.joint_tree import Tree
 from fleet_seif.messages import LandmarkName
-from fleet_seif.records import UNKNOWN_SIGNATURE, Floats
+from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints
 
 __all__ = [
     "JointSolution", "JointSolver", "Life", "Pair", "landmark_chi_square", "landmark_classes", "landmark_names",
-    "marginal_covariances", "one_thread", "solve",
+    "marginal_chi_square", "marginal_covariances", "one_thread", "solve",
 ]  # fmt: skip
 
 F = TypeVar("F", bound=Callable[..., object])
@@ -125,19 +126,30 @@ def marginal_covariances(solution: JointSolution) -> tuple[Floats, Floats]:
 def landmark_chi_square(solution: JointSolution, error: Floats, chosen: NDArray[np.bool_] | None = None) -> float:
     """d' P^-1 d with the joint covariance P of the chosen landmarks (all by default).
 
-    P^-1 is the Schur complement of all other variables: H_cc - H_co H_oo^-1 H_oc.
-
     Args:
         error: d, shape (k, 2), m, one row for each chosen landmark.
         chosen: which landmarks, shape (n,).
     """
-    n = len(solution.classes)
-    rows = np.zeros(len(solution.mean), bool)
-    rows[: 2 * n] = True if chosen is None else np.repeat(chosen, 2)
-    inner, outer = np.flatnonzero(rows), np.flatnonzero(~rows)
+    every = np.ones(len(solution.classes), bool)
+    return marginal_chi_square(solution.H, np.flatnonzero(np.repeat(every if chosen is None else chosen, 2)), error)
+
+
+def marginal_chi_square(H: scipy.sparse.csr_array, rows: Ints, error: Floats) -> float:
+    """d' P^-1 d with the joint covariance P of the chosen rows of a system with information H.
+
+    P^-1 is the Schur complement of all other variables: H_cc - H_co H_oo^-1 H_oc.
+
+    Args:
+        rows: which rows, ascending, shape (k,).
+        error: d, k values in any shape.
+
+    Raises:
+        NumericalError: H is not positive definite.
+    """
+    other = np.setdiff1d(np.arange(H.shape[0]), rows)
     d = error.ravel()
-    value = float(d @ (solution.H[inner][:, inner] @ d))
-    if len(outer):
-        pulled = solution.H[outer][:, inner] @ d
-        value -= float(pulled @ SparseFactor(solution.H[outer][:, outer]).solve(pulled))
+    value = float(d @ (H[rows][:, rows] @ d))
+    if len(other):
+        pulled = H[other][:, rows] @ d
+        value -= float(pulled @ SparseFactor(H[other][:, other]).solve(pulled))
     return value

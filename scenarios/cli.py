@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import json
 import logging
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,9 @@ from fleet_seif.messages import check_name
 from fleet_seif.warm_up import warm_up
 from scenarios import chaos_runs, children, output, tools, watch
 from scenarios.access import Kind
+from scenarios.batch import STAGES
 from scenarios.config import ScenarioError, load_scenario, shipped
+from scenarios.evaluate import read_run, score_run, score_table, score_with_batch
 from scenarios.experiments.names import EXPERIMENTS, find_experiment, run_experiment, summary_table
 from scenarios.experiments.study import png_of, summary_of
 from scenarios.launch import run_processes
@@ -362,6 +365,27 @@ def experiment(
         )
     console.print(summary_table(chosen, rows, quick))
     _say(f"figure: {png_of(folder, name)}   summary: {summary_of(folder)}")
+
+
+@app.command("evaluate")
+@_clear_errors()
+def evaluate_run(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="What 'run SCENARIO --out DIR' has left.")],
+    batch: Annotated[bool, typer.Option("--batch", help="Set gtsam's batch over all readings beside it.")] = False,
+    robust: Annotated[bool, typer.Option("--robust", help="The same, robust: for recorded data.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Score a finished run against the truth: errors of maps and poses, NEES with its band, bytes a step."""
+    stored = read_run(folder)
+    if batch or robust:
+        with progress_bars(errors, STAGES, quiet=False) as progress:
+            scored = score_with_batch(stored, robust=robust, progress=progress)
+    else:
+        scored = score_run(stored)
+    if as_json:
+        console.print_json(json.dumps(scored, allow_nan=False))
+    else:
+        console.print(score_table(scored))
 
 
 def _endpoints(given: list[str] | None, config: Path | None) -> list[str]:

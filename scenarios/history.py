@@ -5,9 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet_seif.envelope import KIND_SNAPSHOT, kind_of
 from fleet_seif.errors import NumericalError
 from fleet_seif.joint import JointSolution, marginal_covariances, solve
+from fleet_seif.messages import FrameStatus
 from fleet_seif.records import Floats
+from fleet_seif.wire import decode_message
 from fusion.ledger import Ledger
 from scenarios.recording import Log, Recording
 
@@ -60,6 +63,30 @@ def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
         except NumericalError:
             continue
         yield Moment(time_s=time_s, solution=solution, landmark_cov=marginal_covariances(solution)[0])
+
+
+def pose_times(ledger: Ledger, poses: Sequence[tuple[str, int, int]]) -> Floats:
+    """When each pose of a joint solution was, by its vehicle's own time, s, shape (p,).
+
+    Pose k of a life is where its frame k-1 has ended, the newest where the last has. NaN where no message says so any
+    more (a snapshot has taken its place) or yet.
+
+    Args:
+        poses: (vehicle, life, k), k -1 for the newest, as `JointSolution.poses`.
+    """
+    at: dict[tuple[str, int, int], float] = {}
+    for stream in ledger.streams.values():
+        for message in (decode_message(data) for data in stream.log if kind_of(data) != KIND_SNAPSHOT):
+            if message.hello is not None and message.hello.continues is None:
+                at.setdefault((stream.vehicle, stream.number, 0), message.time_s)
+            for part in message.parts:
+                if part.status is FrameStatus.ENDED:
+                    at.setdefault((stream.vehicle, stream.number, part.frame + 1), message.time_s)
+    last: dict[tuple[str, int], int] = {}
+    for vehicle, life, k in poses:
+        last[vehicle, life] = max(last.get((vehicle, life), 0), k)
+    keys = [(vehicle, life, k if k >= 0 else last[vehicle, life] + 1) for vehicle, life, k in poses]
+    return np.array([at.get(key, np.nan) for key in keys])
 
 
 def shared_since(a: Log, b: Log) -> float | None:

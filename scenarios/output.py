@@ -75,8 +75,10 @@ def write_trajectory(path: Path, time_s: Floats, poses: Floats) -> None:
     np.savetxt(path, table, fmt="%.9f")
 
 
-def write_map(folder: Path, solution: JointSolution, landmark_cov: Floats, landmark_truth: Ints) -> None:
-    """map.npz and map.json: the canonical map with its joint system."""
+def write_map(
+    folder: Path, solution: JointSolution, landmark_cov: Floats, landmark_truth: Ints, pose_time_s: Floats
+) -> None:
+    """map.npz and map.json: the canonical map with its joint system. pose_time_s (p,): of `solution.poses`."""
     newest = [i for i, (_, _, k) in enumerate(solution.poses) if k < 0]
     vehicles = [solution.poses[i][0] for i in newest]
     H = solution.H.tocsr()
@@ -88,6 +90,7 @@ def write_map(folder: Path, solution: JointSolution, landmark_cov: Floats, landm
         landmark_truth=landmark_truth,
         vehicles=np.array(vehicles, dtype=np.str_),
         pose_mean=solution.pose_mean[newest],
+        pose_time_s=pose_time_s,
         H_data=H.data,
         H_indices=H.indices,
         H_indptr=H.indptr,

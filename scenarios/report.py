@@ -12,7 +12,7 @@ from fusion.ledger import Ledger
 from scenarios import output
 from scenarios.config import Scenario
 from scenarios.figure import draw_figure, figure_times
-from scenarios.history import meetings, replay, uncertainty_of
+from scenarios.history import meetings, pose_times, replay, uncertainty_of
 from scenarios.recording import Recording
 from scenarios.score import MapScore, score_map, score_vehicle
 from vehicles.drive import DriveResult
@@ -94,7 +94,8 @@ def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
         output.write_trajectory(folder / "trajectory" / f"{name}.tum", log.time_s, run.drives[name].pose)
         output.write_trajectory(folder / "trajectory" / f"{name}_truth.tum", log.time_s, log.truth_pose)
     output.write_truth(folder, run.recording)
-    output.write_map(folder, outcome.solution, outcome.landmark_cov, outcome.score.landmark_truth)
+    pose_time_s = pose_times(run.ledger, outcome.solution.poses)
+    output.write_map(folder, outcome.solution, outcome.landmark_cov, outcome.score.landmark_truth, pose_time_s)
     times = figure_times(run.scenario.figure, run.recording)
     draw_figure(
         folder / "figure.png",

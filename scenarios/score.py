@@ -2,13 +2,24 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
+import scipy.stats
 
 from fleet_seif.joint import JointSolution, landmark_chi_square
 from fleet_seif.records import Floats, Ints
 from scenarios.recording import Log, Recording
 from vehicles.drive import DriveResult
+
+BAND: Final = 0.95
+"""Share of runs whose NEES lies in the band that is shown with it, where errors are what a map says they are."""
+
+
+def chi_square_band(dof: int) -> tuple[float, float]:
+    """Between which a mean of squared normalised errors per degree of freedom lies with probability BAND."""
+    low, high = (float(scipy.stats.chi2.ppf(p, dof)) / dof for p in ((1 - BAND) / 2, (1 + BAND) / 2))
+    return low, high
 
 
 def rmse(error: Floats) -> float | None:
@@ -55,12 +66,8 @@ class MapScore:
 
 def score_map(solution: JointSolution, landmark_cov: Floats, recording: Recording) -> MapScore:
     """Errors, consistency and merges of a joint map. landmark_cov (n, 2, 2), m^2."""
-    truths = {name: signature_truth(log) for name, log in recording.logs.items()}
-    member_truth = [
-        [truths[name.vehicle].get(signature, -1) for name in names]
-        for names, signature in zip(solution.classes, solution.signatures, strict=True)
-    ]
-    landmark_truth = np.array([_majority(values) for values in member_truth], np.int64)
+    member_truth = _member_truth(solution, recording)
+    landmark_truth = np.array([majority(values) for values in member_truth], np.int64)
     matched = landmark_truth >= 0
     truth = recording.landmarks[landmark_truth[matched]]
     mean, cov = solution.landmark_mean[matched], landmark_cov[matched]
@@ -84,7 +91,21 @@ def score_map(solution: JointSolution, landmark_cov: Floats, recording: Recordin
     )
 
 
-def _majority(values: list[int]) -> int:
+def landmark_truths(solution: JointSolution, recording: Recording) -> Ints:
+    """Which true landmark each landmark of a joint map is by most of its vehicles' sightings, -1 unknown, (n,)."""
+    return np.array([majority(values) for values in _member_truth(solution, recording)], np.int64)
+
+
+def _member_truth(solution: JointSolution, recording: Recording) -> list[list[int]]:
+    truths = {name: signature_truth(log) for name, log in recording.logs.items()}
+    return [
+        [truths[name.vehicle].get(signature, -1) for name in names]
+        for names, signature in zip(solution.classes, solution.signatures, strict=True)
+    ]
+
+
+def majority(values: list[int]) -> int:
+    """The most frequent of the values that are not negative, of equals the least; -1 where there is none."""
     known = [value for value in values if value >= 0]
     return max(sorted(set(known)), key=known.count) if known else -1
 

@@ -18,7 +18,7 @@ from fleet_seif.joint import one_thread
 from fleet_seif.models import COMPASS_XY
 from fleet_seif.records import Floats
 from scenarios.experiments.association import likelihood_errors
-from scenarios.experiments.confidence import LINEAR, chi_square_band, eseif
+from scenarios.experiments.confidence import LINEAR, eseif
 from scenarios.experiments.correlation import along_the_map, normalised, strengths
 from scenarios.experiments.measures import (
     EIF,
@@ -38,6 +38,7 @@ from scenarios.experiments.measures import (
 from scenarios.experiments.names import EXPERIMENTS, run_experiment
 from scenarios.experiments.study import Row, csv_of, png_of, summary_of, write_csv, write_summary
 from scenarios.experiments.worlds import World, compass_world, paper_world
+from scenarios.score import chi_square_band
 from tests.processes import invoke, refused
 from tests.strategies import settled
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import scipy.stats
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullLocator
 
@@ -22,13 +21,13 @@ from scenarios.experiments.measures import EIF, EKF, Candidate, Outcome, compare
 from scenarios.experiments.study import Progress, Row, csv_of, png_of, write_csv
 from scenarios.experiments.worlds import COMPASS, compass_world, paper_world
 from scenarios.figure import GREY, INK
+from scenarios.score import BAND, chi_square_band
 
 NAME: Final = "confidence"
 TITLE: Final = "What a filter claims to know, against its errors (SEIF paper, Fig. 15, 16)"
 LANDMARKS: Final = 50
 WORLDS: Final = 20
 LINEAR_WORLDS: Final = 100
-BAND: Final = 0.95
 LIKELIHOOD_WORLDS: Final = 3
 PAPER_LIKELIHOOD_ERROR: Final = 3.4e-4
 ACTIVE: Final = (4, 6, 8, 10, 15, 20, 30)
@@ -67,12 +66,6 @@ def run(out: Path, seed: int, quick: bool, progress: Progress) -> list[Row]:
     _draw(png_of(out, NAME), outcomes, active, rhos)
     rows = _nonlinear_rows(outcomes) + _linear_rows(outcomes)
     return rows + _likelihood_rows(seeds[:LIKELIHOOD_WORLDS], steps)
-
-
-def chi_square_band(dof: int) -> tuple[float, float]:
-    """Between which a mean of squared normalised errors per degree of freedom lies with probability BAND."""
-    low, high = (float(scipy.stats.chi2.ppf(p, dof)) / dof for p in ((1 - BAND) / 2, (1 + BAND) / 2))
-    return low, high
 
 
 def _values(outcomes: Sequence[Outcome], world: str, label: str, value: Value) -> Floats:
