@@ -166,8 +166,8 @@ def _forward_into(g: Floats, D: Floats, W: Floats, rows: Ints) -> None:
         v[i] = y
         for j in range(i + 1, e):
             v[j] -= D[i, j] * y
-        for j in range(n - e):
-            v[e + j] -= W[i, j] * y
+    if 0 < e < n:
+        v[e:] -= np.dot(v[:e], W)
     for i in range(n):
         g[rows[i]] = v[i]
 
@@ -177,13 +177,10 @@ def _backward_into(g: Floats, D: Floats, W: Floats, rows: Ints) -> None:
     """x_E = D^-1 (y_E - W x_B) in place of y_E."""
     e, n = len(D), len(rows)
     v = g[rows]
+    if 0 < e < n:
+        v[:e] -= np.dot(W, v[e:])
     for i in range(e - 1, -1, -1):
-        total = v[i]
-        for j in range(n - e):
-            total -= W[i, j] * v[e + j]
-        for j in range(i + 1, e):
-            total -= D[i, j] * v[j]
-        v[i] = total / D[i, i]
+        v[i] = (v[i] - np.dot(D[i, i + 1 :], v[i + 1 : e])) / D[i, i]
         g[rows[i]] = v[i]
 
 
