@@ -158,14 +158,12 @@ def evaluate_into(
 def _prior_into(g: Floats, frames: Frames, f: int, X: Floats, turn: float) -> float:
     """Cost of the prior of T_f, and its part of g."""
     t, cost = frames.start[f], 0.0
-    d = X[t] - frames.given[f]
-    d[2] -= turn
     for a in range(3):
         q = 0.0
         for b in range(3):
-            q += frames.prior[f, a, b] * d[b]
+            q += frames.prior[f, a, b] * (X[t, b] - frames.given[f, b] - (turn if b == 2 else 0.0))
         g[t, a] -= q
-        cost += q * d[a]
+        cost += q * (X[t, a] - frames.given[f, a] - (turn if a == 2 else 0.0))
     return cost
 
 
@@ -211,14 +209,16 @@ def place_into(X: Floats, known: Ints, frames: Frames, chosen: Ints) -> None:
     for f in chosen:
         start, row = frames.start[f], frames.first_row[f]
         if start >= 0 and known[start] == 0:
-            X[start], known[start] = frames.given[f], 1
+            known[start] = 1
+            for a in range(3):
+                X[start, a] = frames.given[f, a]
         tx, ty, angle = _pose_of(frames, f, X)
         c, s = math.cos(angle), math.sin(angle)
         for v in range(frames.first_variable[f], frames.first_variable[f + 1]):
-            i, m = frames.variable[v], frames.mean[row:]
+            i, m_x, m_y = frames.variable[v], frames.mean[row], frames.mean[row + 1]
             if known[i] == 0:
-                X[i, 0], X[i, 1], known[i] = tx + c * m[0] - s * m[1], ty + s * m[0] + c * m[1], 1
-                X[i, 2] = angle + m[2] if v == frames.first_variable[f] else 0.0
+                X[i, 0], X[i, 1], known[i] = tx + c * m_x - s * m_y, ty + s * m_x + c * m_y, 1
+                X[i, 2] = angle + frames.mean[row + 2] if v == frames.first_variable[f] else 0.0
             row += 3 if v == frames.first_variable[f] else 2
 
 
@@ -288,9 +288,9 @@ def add_pieces_into(F: Floats, frames: Frames, pieces: Ints, at: Evaluation, pla
         first, start = frames.first_variable[f], frames.start[f]
         tx, ty, angle = _pose_of(frames, f, at.X)
         c, s = math.cos(angle), math.sin(angle)
-        T[:] = 0.0
-        if start >= 0 and pieces[n, 1] == 0:
-            T[:] = frames.prior[f]
+        for a in range(3):
+            for b in range(3):
+                T[a, b] = frames.prior[f, a, b] if pieces[n, 1] == 0 else 0.0
         for k in range(frames.first_block[f] + pieces[n, 1], frames.first_block[f] + pieces[n, 2]):
             p, o = frames.rows[k], frames.cols[k]
             v, w = frames.variable[first + p], frames.variable[first + o]

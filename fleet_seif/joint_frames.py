@@ -159,11 +159,8 @@ def _cut(rows: Ints, cols: Ints, count: int, most: int) -> tuple[Ints, int]:
 
 def _pieces(rows: Ints, cols: Ints, count: int) -> Ints:
     """A frame in pieces: one where it is small, or so full that pieces would be more work than the whole."""
-    whole = np.array([[0, len(rows)]])
-    if count <= PIECE_VARIABLES_MAX:
-        return whole
     pieces, squares = _cut(rows, cols, count, PIECE_VARIABLES_MAX)
-    return pieces if squares < count * count else whole
+    return pieces if squares < count * count else np.array([[0, len(rows)]])
 
 
 def prepared(delta: FrameDelta) -> FrameRecord:

@@ -46,10 +46,10 @@ class JointSolver:
         Raises NumericalError where the system is not positive definite or does not settle.
         """
         self._estimate = None
-        registry = Registry(self._records)
-        added = registry.register(lives, classes).added
         if not any(life.frames for life in lives):
             raise NumericalError("nothing to solve: no vehicle has contributed anything yet")
+        registry = Registry(self._records)
+        added = registry.register(lives, classes).added
         estimate = Estimate(registry)
         estimate.grow()
         numbers = np.array([max(key[2], 0) for f in added if (key := registry.keys[f]) is not None])
@@ -69,14 +69,14 @@ class JointSolver:
         Raises NumericalError where the system is not positive definite or does not settle.
         """
         estimate = self._estimate
-        if estimate is not None:
+        if estimate is not None and any(life.frames for life in lives):
             self._estimate = None
             try:
                 change = estimate.registry.register(lives, classes)
                 if 2 * len(change.added) <= len(estimate.active):
                     estimate.follow(change)
                     settled, at = estimate.settle(WARM_ITERATIONS_MAX, WARM_ENOUGH)
-                    if settled and len(estimate.active):
+                    if settled:
                         self._estimate = estimate
                         return _solution(estimate, at, lives, classes)
             except NumericalError:  # replayed below, which raises it again if it is not for the start

@@ -89,7 +89,8 @@ def _merged(a: Ints, a_counts: Ints, b: Ints, b_counts: Ints, total: Ints) -> tu
         else:
             rest[m], rest_counts[m] = v, count
             m += 1
-    variables[n : n + m], counts[n : n + m] = rest[:m], rest_counts[:m]
+    for k in range(m):
+        variables[n + k], counts[n + k] = rest[k], rest_counts[k]
     return variables[: n + m].copy(), counts[: n + m].copy(), n
 
 
@@ -129,20 +130,29 @@ def _extend_into(D: Floats, W: Floats, U: Floats, child: Floats, place: Ints) ->
     place: the row in the front of each of the child's rows. Those eliminated here ascend, and so do those passed on.
     """
     e, n = len(D), len(place)
-    here, on = np.flatnonzero(place < e), np.flatnonzero(place >= e)
-    to = place[on] - e
-    for t in range(len(here)):
-        a = here[t]
+    order, here = np.empty(n, np.int64), 0
+    for a in range(n):
+        if place[a] < e:
+            order[here] = a
+            here += 1
+    on = here
+    for a in range(n):
+        if place[a] >= e:
+            order[on] = a
+            on += 1
+    for t in range(here):
+        a = order[t]
         row, at = place[a], a * n - a * (a + 1) // 2  # child (a, b) is child[at + b] for b >= a
-        for u in range(t, len(here)):
-            D[row, place[here[u]]] += child[at + here[u]]
-        for u in range(len(on)):
-            b = on[u]
-            W[row, to[u]] += child[at + b] if b >= a else child[b * n - b * (b + 1) // 2 + a]
-    for t in range(len(on)):
-        row, at = to[t], on[t] * n - on[t] * (on[t] + 1) // 2
-        for u in range(t, len(on)):
-            U[row, to[u]] += child[at + on[u]]
+        for u in range(t, here):
+            D[row, place[order[u]]] += child[at + order[u]]
+        for u in range(here, n):
+            b = order[u]
+            W[row, place[b] - e] += child[at + b] if b >= a else child[b * n - b * (b + 1) // 2 + a]
+    for t in range(here, n):
+        a = order[t]
+        row, at = place[a] - e, a * n - a * (a + 1) // 2
+        for u in range(t, n):
+            U[row, place[order[u]] - e] += child[at + order[u]]
 
 
 @kernel
@@ -151,8 +161,9 @@ def _packed(U: Floats) -> Floats:
     n, at = len(U), 0
     out = np.empty(n * (n + 1) // 2)
     for i in range(n):
-        out[at : at + n - i] = U[i, i:]
-        at += n - i
+        for j in range(i, n):
+            out[at] = U[i, j]
+            at += 1
     return out
 
 
@@ -166,8 +177,10 @@ def _forward_into(g: Floats, D: Floats, W: Floats, rows: Ints) -> None:
         v[i] = y
         for j in range(i + 1, e):
             v[j] -= D[i, j] * y
+    if 0 < e < n:
+        pulled = np.dot(v[:e], W)
         for j in range(n - e):
-            v[e + j] -= W[i, j] * y
+            v[e + j] -= pulled[j]
     for i in range(n):
         g[rows[i]] = v[i]
 
@@ -177,13 +190,12 @@ def _backward_into(g: Floats, D: Floats, W: Floats, rows: Ints) -> None:
     """x_E = D^-1 (y_E - W x_B) in place of y_E."""
     e, n = len(D), len(rows)
     v = g[rows]
+    if 0 < e < n:
+        pulled = np.dot(W, v[e:])
+        for i in range(e):
+            v[i] -= pulled[i]
     for i in range(e - 1, -1, -1):
-        total = v[i]
-        for j in range(n - e):
-            total -= W[i, j] * v[e + j]
-        for j in range(i + 1, e):
-            total -= D[i, j] * v[j]
-        v[i] = total / D[i, i]
+        v[i] = (v[i] - np.dot(D[i, i + 1 :], v[i + 1 : e])) / D[i, i]
         g[rows[i]] = v[i]
 
 

@@ -12,6 +12,8 @@ from fleet_seif.config import FilterSettings
 from fleet_seif.definite import is_positive_definite
 from fleet_seif.frames import FramedFilter
 from fleet_seif.information import FrameTotal, largest_growth, to_information
+from fleet_seif.joint import Life, landmark_classes, marginal_covariances, solve
+from fleet_seif.joint_tree import LEAF_PIECES_MAX
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello
 from fleet_seif.records import Reading, Sightings
 from fleet_seif.seif import Seif
@@ -52,6 +54,11 @@ def warm_up(
     is_positive_definite(total.delta())
     largest_growth(total.delta())
     Seif(FilterSettings()).published()
+    life = Life(
+        vehicle="v", life=0, start_pose=np.zeros(3), start_pose_cov=np.eye(3), signatures=(0, 1, 2),
+        frames=(total.delta(),) * (LEAF_PIECES_MAX + 1),
+    )  # fmt: skip
+    marginal_covariances(solve([life], landmark_classes([life])))
     part = FramePart(frame=0, status=FrameStatus.OPENED, delta=total.delta())
     hello = Hello(
         software="", life=0, placed=True, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)),
