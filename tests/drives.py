@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 
@@ -99,11 +100,17 @@ def reading(time_s: float, sightings: Sightings, u: tuple[float, float, float] =
     return Reading(time_s=time_s, odometry=np.array(u), odometry_cov=np.diag(ODOMETRY_STD**2), sightings=sightings)
 
 
-def core_of(vehicle: str, start_pose: Floats, fleet: str = FLEET, model: int = RANGE_BEARING) -> VehicleCore:
+def core_of(
+    vehicle: str,
+    start_pose: Floats,
+    fleet: str = FLEET,
+    model: int = RANGE_BEARING,
+    frames: Literal["single", "adaptive"] = "adaptive",
+) -> VehicleCore:
     identity = Identity(
         fleet=fleet, vehicle=vehicle, epoch=Epoch(1, 77), start_pose=start_pose, start_pose_cov=np.zeros((3, 3))
     )
-    return VehicleCore(identity, FilterSettings(active_max=4), PublishSettings(window=10_000), model)
+    return VehicleCore(identity, FilterSettings(active_max=4, frames=frames), PublishSettings(window=10_000), model)
 
 
 def commit(core: VehicleCore, store: Store | None = None) -> None:

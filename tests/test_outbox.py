@@ -300,7 +300,7 @@ def test_unsent_messages_above_the_limit_are_coalesced_and_an_ended_stream_still
 
 def test_a_snapshot_of_a_vehicle_is_what_its_messages_up_to_an_acknowledged_check_point_leave_behind() -> None:
     log = drive(square(15, 5.0, 3), steps=70, seed=10)
-    core = core_of("v", log.start_pose)
+    core = core_of("v", log.start_pose, frames="single")
     core.start(0.0, log.start)
     for each in log.readings:
         core.step(each)
