@@ -236,7 +236,7 @@ class VehicleCore:
     def _replay(self, kept: dict[bytes, bytes]) -> None:
         """The filter as it was: its last state, and the readings since."""
         if records.STATE in kept:
-            state = msgpack.unpackb(kept[records.STATE])
+            state = msgpack.unpackb(kept[records.STATE], use_list=False)
             self.filter.restore(state["filter"])
             self.steps, self.time_s, self.healthy = state["steps"], state["time_s"], state["healthy"]
         for key in sorted(name for name in kept if name[:1] == records.READING):
