@@ -84,7 +84,7 @@ def moments(draw: st.DrawFn) -> tuple[list[Life], Classes]:
 
 
 @given(st.lists(moments(), min_size=2, max_size=5))
-@settings(settled, max_examples=25)
+@settings(settled, max_examples=15)
 def test_a_warm_solution_is_the_cold_one_whatever_came_went_or_changed_before(
     history: list[tuple[list[Life], Classes]],
 ) -> None:
@@ -98,7 +98,7 @@ def test_a_warm_solution_is_the_cold_one_whatever_came_went_or_changed_before(
 
 
 @given(st.lists(moments(), min_size=1, max_size=4))
-@settings(settled, max_examples=15)
+@settings(settled, max_examples=8)
 def test_a_tree_with_any_history_is_the_factor_of_the_dense_matrix(
     history: list[tuple[list[Life], Classes]],
 ) -> None:
