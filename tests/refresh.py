@@ -191,7 +191,7 @@ def main() -> None:
         refreshes(fleet(10_000, 5, 600, SPACING_M), 596, 600, covariances=True)
     if "flat" in chosen:
         drives = fleet(2000, 3, 400, WIDE_M)
-        tenth, end = (refreshes(drives, last - 10, last) for last in (45, 400))
+        tenth, _, _, end = (refreshes(drives, last - 10, last) for last in (40, 80, 200, 400))
         report(f"mean refresh at the end / at the tenth: {end / tenth:.2f}")
 
 

@@ -134,6 +134,24 @@ def test_a_tree_with_any_history_is_the_factor_of_the_dense_matrix(
             assert np.all(np.abs(error) <= 1e-7 * np.outer(scale[k], scale[k]))
 
 
+def test_only_the_nodes_above_a_frame_that_was_linearised_anew_are_redone() -> None:
+    registry = Registry(Records())
+    estimate = Estimate(registry)
+    lives = [drive.life() for drive in drives()]
+    estimate.follow(registry.register(lives, landmark_classes(lives)))
+    at, tree = estimate.settle(20)[1], estimate.tree
+    tree.factor(registry.frames, at)
+    assert tree.factor(registry.frames, at) == 0
+    nodes = tree.nodes()
+    for leaf in (node for node in nodes if not node.children):
+        above, node = 0, leaf
+        while node.parent is not None:
+            above, node = above + 1, node.parent
+        tree.relinearise(leaf.pieces[:1])
+        assert tree.factor(registry.frames, at) == above + 1
+    assert above + 1 < len(nodes)
+
+
 @given(st.lists(moments(), min_size=1, max_size=2), moments())
 @settings(settled, max_examples=15)
 def test_a_replay_depends_on_nothing_but_lives_and_classes(
