@@ -46,13 +46,6 @@ def moved(delta: FrameDelta, by: Floats) -> FrameDelta:
     return dataclasses.replace(delta, b=delta.b + np.rint(b / B_QUANTUM).astype(np.int64))
 
 
-def turned(delta: FrameDelta, angle: float) -> FrameDelta:
-    """The same frame with its end pose turned."""
-    by = np.zeros(len(delta.b))
-    by[2] = angle
-    return moved(delta, by)
-
-
 def sigmas(a: JointSolution, b: JointSolution) -> float:
     """Largest difference of two means over the same variables, in standard deviations."""
     assert (a.classes, a.poses) == (b.classes, b.poses)
@@ -205,15 +198,18 @@ def test_a_weight_is_hubers_and_the_joint_matrix_holds_the_frames_information_by
     np.testing.assert_allclose(solution.H[end : end + 2][:, end : end + 2].toarray(), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [1.0, np.pi, 4.0])
-def test_a_frame_that_is_half_a_turn_off_does_not_keep_the_map_from_settling(angle: float) -> None:
-    """The cost must not jump where the residual's heading would go on to the next turn."""
-    lives = [drive.life() for drive in drives()]
-    frames = list(lives[1].frames)
-    frames[4] = turned(frames[4], angle)
-    lives[1] = dataclasses.replace(lives[1], frames=tuple(frames))
-    solution = solve(lives, landmark_classes(lives))
-    assert ("v1", 0, 4) in {solution.frames[f] for f in np.flatnonzero(solution.weight < 0.5).tolist()}
+@pytest.mark.parametrize("seed", [2, 7, 11, 13])
+def test_a_frame_of_each_vehicle_that_is_nonsense_does_not_keep_the_map_from_settling(seed: int) -> None:
+    """Metres and turns off. With whole turns of headings chosen at each step these four did not settle."""
+    rng = np.random.default_rng(seed)
+    lives = []
+    for drive in drives():
+        life, f = drive.life(), int(rng.integers(FRAMES))
+        delta = life.frames[f]
+        b = delta.b + (1e4 / B_QUANTUM * rng.normal(size=len(delta.b))).astype(np.int64)
+        frames = (*life.frames[:f], dataclasses.replace(delta, b=b), *life.frames[f + 1 :])
+        lives.append(dataclasses.replace(life, frames=frames))
+    assert np.count_nonzero(solve(lives, landmark_classes(lives)).weight < 0.5) >= 1
 
 
 def test_single_frames_with_given_start_poses_are_never_weighted_down() -> None:
