@@ -49,11 +49,8 @@ class Estimate:
         self.tree = Tree()
         self.X = np.zeros((0, 3))
         self.damping = 0.0
-        self.redone = 0
-        """Nodes of the tree that were redone so far."""
         self._known = np.zeros(0, np.int64)
         self._pieces: dict[int, list[int]] = {}
-        self._owner: dict[int, int] = {}
         self._heading = np.zeros(0)
         self._z = np.zeros(0)
         self._weight = np.zeros(0)
@@ -185,5 +182,5 @@ class Estimate:
         )
         self.tree.relinearise([piece for f in moved.tolist() for piece in self._pieces[f]])
         remember_into(self._heading, self._z, self._weight, self.frames, moved, self.X, now.z, now.weight)
-        self.redone += self.tree.factor(self.frames, now, self.damping)
+        self.tree.factor(self.frames, now, self.damping)
         return self.tree.solve(now.g)

@@ -344,7 +344,7 @@ class Tree:
         for child, part in zip(node.children, (order[:half], order[half:]), strict=True):
             self._build(child, [numbers[i] for i in part.tolist()])
 
-    def _nodes(self) -> list[Node]:
+    def nodes(self) -> list[Node]:
         """Children before parents."""
         if not self._order:
             self._order = list(_postorder(self.root))
@@ -358,10 +358,10 @@ class Tree:
         Raises NumericalError where the matrix is not positive definite; whatever was stale is stale still.
         """
         if damping != self._damping:
-            for node in self._nodes():
+            for node in self.nodes():
                 node.stale = True
             self._damping = damping
-        stale = [node for node in self._nodes() if node.stale]
+        stale = [node for node in self.nodes() if node.stale]
         for node in stale:
             if node.reshape:
                 self._shape(node)
@@ -406,9 +406,9 @@ class Tree:
     def solve(self, g: Floats) -> Floats:
         """H^-1 g, shape (v, 3) like g; zero where there is no variable."""
         x = g.ravel().copy()
-        for node in self._nodes():
+        for node in self.nodes():
             _forward_into(x, node.D, node.W, node.rows)
-        for node in reversed(self._nodes()):
+        for node in reversed(self.nodes()):
             _backward_into(x, node.D, node.W, node.rows)
         return x.reshape(-1, 3)
 
@@ -421,7 +421,7 @@ class Tree:
         """
         blocks, S = np.zeros((len(self.size), 3, 3)), {}
         S[self.root] = np.empty((0, 0))
-        for node in reversed(self._nodes()):
+        for node in reversed(self.nodes()):
             S_F = _selected(node.D, node.W, S.pop(node))
             at = 0
             for v in node.variables[: node.eliminated].tolist():

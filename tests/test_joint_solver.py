@@ -46,13 +46,6 @@ def moved(delta: FrameDelta, by: Floats) -> FrameDelta:
     return dataclasses.replace(delta, b=delta.b + np.rint(b / B_QUANTUM).astype(np.int64))
 
 
-def turned(delta: FrameDelta, angle: float) -> FrameDelta:
-    """The same frame with its end pose turned."""
-    by = np.zeros(len(delta.b))
-    by[2] = angle
-    return moved(delta, by)
-
-
 def sigmas(a: JointSolution, b: JointSolution) -> float:
     """Largest difference of two means over the same variables, in standard deviations."""
     assert (a.classes, a.poses) == (b.classes, b.poses)
@@ -84,7 +77,7 @@ def moments(draw: st.DrawFn) -> tuple[list[Life], Classes]:
 
 
 @given(st.lists(moments(), min_size=2, max_size=5))
-@settings(settled, max_examples=25)
+@settings(settled, max_examples=15)
 def test_a_warm_solution_is_the_cold_one_whatever_came_went_or_changed_before(
     history: list[tuple[list[Life], Classes]],
 ) -> None:
@@ -98,7 +91,7 @@ def test_a_warm_solution_is_the_cold_one_whatever_came_went_or_changed_before(
 
 
 @given(st.lists(moments(), min_size=1, max_size=4))
-@settings(settled, max_examples=15)
+@settings(settled, max_examples=8)
 def test_a_tree_with_any_history_is_the_factor_of_the_dense_matrix(
     history: list[tuple[list[Life], Classes]],
 ) -> None:
@@ -132,6 +125,24 @@ def test_a_tree_with_any_history_is_the_factor_of_the_dense_matrix(
             assert np.all(np.abs(found[v, : tree.size[v]] - x[k]) <= 1e-6 * scale[k])
             error = blocks[v, : tree.size[v], : tree.size[v]] - P[k, k]
             assert np.all(np.abs(error) <= 1e-7 * np.outer(scale[k], scale[k]))
+
+
+def test_only_the_nodes_above_a_frame_that_was_linearised_anew_are_redone() -> None:
+    registry = Registry(Records())
+    estimate = Estimate(registry)
+    lives = [drive.life() for drive in drives()]
+    estimate.follow(registry.register(lives, landmark_classes(lives)))
+    at, tree = estimate.settle(20)[1], estimate.tree
+    tree.factor(registry.frames, at)
+    assert tree.factor(registry.frames, at) == 0
+    nodes = tree.nodes()
+    for leaf in (node for node in nodes if not node.children):
+        above, node = 0, leaf
+        while node.parent is not None:
+            above, node = above + 1, node.parent
+        tree.relinearise(leaf.pieces[:1])
+        assert tree.factor(registry.frames, at) == above + 1
+    assert above + 1 < len(nodes)
 
 
 @given(st.lists(moments(), min_size=1, max_size=2), moments())
@@ -187,15 +198,18 @@ def test_a_weight_is_hubers_and_the_joint_matrix_holds_the_frames_information_by
     np.testing.assert_allclose(solution.H[end : end + 2][:, end : end + 2].toarray(), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [1.0, np.pi, 4.0])
-def test_a_frame_that_is_half_a_turn_off_does_not_keep_the_map_from_settling(angle: float) -> None:
-    """The cost must not jump where the residual's heading would go on to the next turn."""
-    lives = [drive.life() for drive in drives()]
-    frames = list(lives[1].frames)
-    frames[4] = turned(frames[4], angle)
-    lives[1] = dataclasses.replace(lives[1], frames=tuple(frames))
-    solution = solve(lives, landmark_classes(lives))
-    assert ("v1", 0, 4) in {solution.frames[f] for f in np.flatnonzero(solution.weight < 0.5).tolist()}
+@pytest.mark.parametrize("seed", [2, 7, 11, 13])
+def test_a_frame_of_each_vehicle_that_is_nonsense_does_not_keep_the_map_from_settling(seed: int) -> None:
+    """Metres and turns off. With whole turns of headings chosen at each step these four did not settle."""
+    rng = np.random.default_rng(seed)
+    lives = []
+    for drive in drives():
+        life, f = drive.life(), int(rng.integers(FRAMES))
+        delta = life.frames[f]
+        b = delta.b + (1e4 / B_QUANTUM * rng.normal(size=len(delta.b))).astype(np.int64)
+        frames = (*life.frames[:f], dataclasses.replace(delta, b=b), *life.frames[f + 1 :])
+        lives.append(dataclasses.replace(life, frames=frames))
+    assert np.count_nonzero(solve(lives, landmark_classes(lives)).weight < 0.5) >= 1
 
 
 def test_single_frames_with_given_start_poses_are_never_weighted_down() -> None:
