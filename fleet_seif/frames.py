@@ -23,7 +23,7 @@ from fleet_seif.errors import NumericalError
 from fleet_seif.filters import Names, StepResult
 from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
 from fleet_seif.frame_deltas import quantised
-from fleet_seif.geometry import act_all, compose
+from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_names, one_thread
 from fleet_seif.messages import FramePart, FrameStatus
@@ -34,8 +34,6 @@ from fleet_seif.seif import Seif, Taken
 log = logging.getLogger(__name__)
 FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
-LOCALISE_STEPS = 5
-"""Steps after which the vehicle's own frames are solved anew."""
 
 
 @dataclass
@@ -131,7 +129,7 @@ class FramedFilter:
         self._solver = JointSolver()
         self._origin = 0, np.zeros(3)
         self._map = np.empty((0, 2))
-        self._localised = self._asked = 0
+        self._localised, self._asked = 0, (0, np.zeros(3))
         self._names = Names()
         self._single = settings.frames == "single"
         self._frame_settings = settings
@@ -159,7 +157,7 @@ class FramedFilter:
 
     @property
     def _open_pose(self) -> Floats:
-        """Where the open frame starts: the last solution, and the ends of the frames that have closed since."""
+        """Where the open frame starts, such that the pose of the last solution is what it was found to be."""
         frame, pose = self._origin
         for end in self.ends[frame:]:
             pose = compose(pose, end)
@@ -180,7 +178,7 @@ class FramedFilter:
     @property
     def is_localisation_due(self) -> bool:
         """Whether enough has happened since the last `own_life`."""
-        return self.frame > 0 and self.steps >= self._localised + LOCALISE_STEPS and not self._single
+        return self.frame > 0 and self.steps >= self._localised + self.settings.localise_steps and not self._single
 
     def localise(self) -> None:
         """Solve this vehicle's own frames, if that is due. Where another thread solves, in three parts: `own_life`,
@@ -190,7 +188,7 @@ class FramedFilter:
 
     def own_life(self) -> Life:
         """What this vehicle has published, in the coordinates of frame 0."""
-        self._localised, self._asked = self.steps, self.frame
+        self._localised, self._asked = self.steps, (self.frame, self.filter.pose)
         return Life(
             vehicle="", life=0, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)), frames=self.published(),
             signatures=tuple(self.signatures),
@@ -209,9 +207,9 @@ class FramedFilter:
         """Take what `solve_own` found."""
         if solution is None:
             return
-        starts = [k for _, _, k in solution.poses]
-        last = self._asked if self._asked in starts else -1
-        self._origin = self._asked, solution.pose_mean[starts.index(last)]
+        frame, pose = self._asked
+        newest = solution.pose_mean[[k for _, _, k in solution.poses].index(-1)]
+        self._origin = frame, compose(newest, between(pose, np.zeros(3)))
         self._map = np.full((len(self.signatures), 2), np.nan)
         self._map[[names[0].number for names in solution.classes]] = solution.landmark_mean
 
@@ -305,7 +303,7 @@ class FramedFilter:
         for closed in self._closed:
             parts += self._correction(closed)
         self._closed.clear()
-        self._localised = self.steps - LOCALISE_STEPS
+        self._localised = self.steps - self.settings.localise_steps
         return tuple(parts)
 
     def state(self) -> dict[str, Any]:
@@ -333,7 +331,7 @@ class FramedFilter:
         self.steps, self._opened = state["steps"], state["opened"]
         if self._single:
             return
-        self._localised = self.steps - LOCALISE_STEPS
+        self._localised = self.steps - self.settings.localise_steps
         self._log = FrameLog.restored(state["log"])
         self._closed = [
             Closed(
