@@ -36,8 +36,8 @@ class FilterSettings(Settings):
     goes wrong: after frame_steps_max steps, frame_landmarks_max landmarks, or once odometry has added up to a standard
     deviation of frame_heading_std_max_rad.
     close_lag_steps: steps after which the correction of a closed frame is published.
-    localise_steps: steps after which a vehicle of several frames solves them as one system, for its live pose and map; in
-    between the open frame's filter goes on alone. Enters nothing that is published.
+    localise_steps: steps after which a vehicle of several frames solves them as one system, for its live pose and
+    map; in between the open frame's filter goes on alone. Enters nothing that is published.
     landmarks_max: landmarks of a frame, for which address space is reserved; a frame on the wire takes 32,767.
     neighbours_max: links of a landmark to others; where a step would make more, its sighting is refused. Not for "eif".
     """
