@@ -60,11 +60,30 @@ def evaluate(run: FinishedRun) -> Outcome:
         "digest": run.ledger.map_digest().hex(),
         **{name: value for name, value in vars(score).items() if name != "landmark_truth"},
         "vehicles": {name: _vehicle(run, name) for name in run.recording.logs},
+        "frames": _frames(solution),
         "meetings": meeting_report(run.ledger, run.recording) if run.scenario.figure == "meetings" else [],
         "sightings_left_out": run.recording.skipped,
         "fusion": run.fusion,
     }
     return Outcome(solution=solution, landmark_cov=landmark_cov, score=score, report=report)
+
+
+def _frames(solution: JointSolution) -> dict[str, Any]:
+    """How many frames the map is made of, and those that disagree with the others so much that they count less."""
+    doubtful = np.flatnonzero(solution.weight < 1.0).tolist()
+    return {
+        "count": len(solution.frames),
+        "weighted_down": [
+            {
+                "vehicle": solution.frames[f][0],
+                "life": solution.frames[f][1],
+                "frame": solution.frames[f][2],
+                "weight": float(solution.weight[f]),
+                "chi_square_per_row": float(solution.chi_square[f] / solution.dof[f]),
+            }
+            for f in doubtful
+        ],
+    }
 
 
 def _vehicle(run: FinishedRun, name: str) -> dict[str, Any]:

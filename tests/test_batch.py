@@ -19,6 +19,7 @@ from scenarios import batch
 from scenarios.batch import BatchSolution, Guess, solve_batch
 from scenarios.recording import Log, Recording
 from scenarios.world import NoiseSettings, WorldSettings, simulate
+from tests.frames_against_batch import compare
 
 MILD = NoiseSettings(forward_std_m=0.005, turn_std_rad=0.03, range_std_m=0.01, bearing_std_rad=0.02)
 SEEDS = range(1, 11)
@@ -253,3 +254,13 @@ def test_strides_cover_every_pose_once_and_none_is_long(runs: list[tuple[int, fl
         longest = max(high - low for low, high in (span[i] for span in spans))
         assert longest <= batch.STRIDE_MAX
         assert longest <= 1 + (steps + 1) / steps * (batch.STRIDE_HEADING_STD_RAD / max(std, 1e-9)) ** 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scenario", "most"), [("three_air_vehicles_mild", 1.1), ("three_air_vehicles", 1.8)])
+def test_a_fused_map_of_frames_is_as_accurate_as_the_batch(scenario: str, most: float) -> None:
+    """Two seeds; twenty by hand: python -m tests.frames_against_batch."""
+    pytest.importorskip("gtsam")
+    found = [compare(scenario, seed, ()) for seed in (1, 2)]
+    assert all(each.ratio is not None and each.ratio < most for each in found)
+    assert all(each.ours.nees_per_dof is not None and each.ours.nees_per_dof < 2.0 for each in found)

@@ -10,6 +10,7 @@ from tests import real_data
 from tests.fleets import outcome_of, run_virtual
 
 SEEDS = range(1, 21)
+FRAMES = ("single", "adaptive")
 LOSSY = ("link.loss=0.3", "link.duplication=0.2", "link.jitter_s=2.0")
 
 
@@ -27,8 +28,9 @@ def is_good(outcome: Outcome) -> bool:
     )
 
 
-def test_three_air_vehicles_reproduces_the_papers_findings() -> None:
-    outcome = outcome_of("three_air_vehicles")
+@pytest.mark.parametrize("frames", FRAMES)
+def test_three_air_vehicles_reproduces_the_papers_findings(frames: str) -> None:
+    outcome = outcome_of("three_air_vehicles", f"filter.frames={frames}")
     assert is_good(outcome), outcome.report
     steps = [(m["vehicles"], m["step"]) for m in outcome.report["meetings"][:2]]
     assert steps[0][0] == ["v1", "v2"]
@@ -38,12 +40,13 @@ def test_three_air_vehicles_reproduces_the_papers_findings() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("frames", FRAMES)
 @pytest.mark.parametrize("name", ["three_air_vehicles", "three_air_vehicles_mild"])
-def test_at_least_18_of_20_seeds_reproduce_the_papers_findings(name: str) -> None:
-    outcomes = {seed: outcome_of(name, seed=seed) for seed in SEEDS}
+def test_at_least_18_of_20_seeds_reproduce_the_papers_findings(name: str, frames: str) -> None:
+    outcomes = {seed: outcome_of(name, f"filter.frames={frames}", seed=seed) for seed in SEEDS}
     errors = [outcome.report["landmark_rmse_m"] for outcome in outcomes.values()]
     bad = [seed for seed, outcome in outcomes.items() if not is_good(outcome)]
-    print(f"{name}: error median {np.median(errors):.4f} m, worst {max(errors):.4f} m, seeds not good {bad}")
+    print(f"{name}, {frames}: error median {np.median(errors):.4f} m, worst {max(errors):.4f} m, seeds not good {bad}")
     assert len(bad) <= 2
 
 
@@ -87,7 +90,7 @@ def test_a_small_window_and_a_small_outbox_do_not_change_the_map() -> None:
     assert max(len(s.log) for s in tight.ledger.streams.values()) < 100
 
 
-@pytest.mark.parametrize("frames", ["single", "adaptive"])
+@pytest.mark.parametrize("frames", FRAMES)
 def test_messages_of_several_steps_give_the_same_map_with_fewer_bytes(frames: str) -> None:
     """A message ends where a frame does, so that none covers more than a frame."""
     settings = ("world.steps=150", f"filter.frames={frames}")
