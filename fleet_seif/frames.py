@@ -25,7 +25,7 @@ from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
 from fleet_seif.frame_deltas import quantised
 from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
-from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_names, one_thread
+from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_names
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Ints, Reading, Sightings
@@ -194,7 +194,6 @@ class FramedFilter:
             signatures=tuple(self.signatures),
         )  # fmt: skip
 
-    @one_thread
     def solve_own(self, life: Life) -> JointSolution | None:
         """The joint solution of `own_life`; None where there is none."""
         try:

@@ -17,15 +17,14 @@ joint_tree (the sparse factor), joint_registry (names and numbers), joint_estima
 frames arrive, and warm).
 """
 
-from collections.abc import Callable, Sequence
-from typing import TypeVar, cast
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse
-import threadpoolctl
 from numpy.typing import NDArray
 
 from fleet_seif.information import POSE
+from fleet_seif.jit import one_thread
 from fleet_seif.joint_frames import SparseFactor
 from fleet_seif.joint_records import Classes, JointSolution, Life
 from fleet_seif.joint_solver import JointSolver
@@ -35,17 +34,8 @@ from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints
 
 __all__ = [
     "JointSolution", "JointSolver", "Life", "Pair", "landmark_chi_square", "landmark_classes", "landmark_names",
-    "marginal_chi_square", "marginal_covariances", "one_thread", "solve",
+    "marginal_chi_square", "marginal_covariances", "solve",
 ]  # fmt: skip
-
-F = TypeVar("F", bound=Callable[..., object])
-_libraries = threadpoolctl.ThreadpoolController()
-
-
-def one_thread(function: F) -> F:
-    """Run a function with single-threaded BLAS: the same bits on any number of cores, no threads waiting for others."""
-    return cast(F, _libraries.wrap(limits=1, user_api="blas")(function))
-
 
 Pair = tuple[LandmarkName, LandmarkName]
 
@@ -98,7 +88,6 @@ def _joined(names: Sequence[LandmarkName], pairs: Sequence[Pair], forbidden: Seq
     return tuple(sorted({tuple(sorted(group)) for group in classes.values()}))
 
 
-@one_thread
 def solve(lives: Sequence[Life], classes: Classes) -> JointSolution:
     """The joint map of these lives, in canonical order (by vehicle, then life): JointSolver.replay.
 

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from fleet_seif.errors import NumericalError
+from fleet_seif.jit import one_thread
 from fleet_seif.joint_assembly import Evaluation
 from fleet_seif.joint_estimate import Estimate
 from fleet_seif.joint_records import Classes, JointSolution, Life, System
@@ -40,6 +41,7 @@ class JointSolver:
         self._records = Records()
         self._estimate: Estimate | None = None
 
+    @one_thread
     def replay(self, lives: Sequence[Life], classes: Classes) -> JointSolution:
         """The joint map of these lives, in canonical order (by vehicle, then life), from nothing.
 
@@ -63,6 +65,7 @@ class JointSolver:
         self._estimate = estimate
         return _solution(estimate, at, lives, classes)
 
+    @one_thread
     def update(self, lives: Sequence[Life], classes: Classes) -> JointSolution:
         """The joint map of these lives, in canonical order, from where the last call left it.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import JointSolver, Life, marginal_covariances, one_thread, solve
+from fleet_seif.joint import JointSolver, Life, marginal_covariances, solve
 from fleet_seif.messages import JointMap, LandmarkName, VehicleState
 from fleet_seif.records import Floats
 from fusion.core import FusionCore
@@ -105,7 +105,6 @@ class MapMaker:
             kept = _classes_of(good, taken.classes)
             return self._solved(taken, good, kept, version, final=final, canonical=canonical)
 
-    @one_thread
     def _solved(
         self, taken: MapInput, lives: tuple[Life, ...], classes: Classes, version: int, *, final: bool, canonical: bool
     ) -> JointMap:

@@ -29,7 +29,7 @@ import scipy.sparse
 
 from fleet_seif.errors import NumericalError, RunError
 from fleet_seif.geometry import between, between_jacobians, compose, wrap
-from fleet_seif.joint import one_thread
+from fleet_seif.jit import one_thread
 from fleet_seif.models import RANGE_BEARING, place
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints
 from scenarios.recording import Log, Recording

@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet_seif.envelope import KIND_SNAPSHOT, kind_of
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import JointSolution, marginal_covariances, solve
+from fleet_seif.joint import JointSolution, JointSolver, marginal_covariances
 from fleet_seif.messages import FrameStatus
 from fleet_seif.records import Floats
 from fleet_seif.wire import decode_message
@@ -49,7 +49,7 @@ def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
         ),
         key=lambda item: item[:2],
     )
-    at = 0
+    at, solver = 0, JointSolver()
     for time_s in times_s:
         while at < len(waiting) and waiting[at][0] <= time_s:
             again.accept(waiting[at][2])
@@ -59,7 +59,7 @@ def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
         if not classes:
             continue
         try:
-            solution = solve(lives, classes)
+            solution = solver.update(lives, classes)
         except NumericalError:
             continue
         yield Moment(time_s=time_s, solution=solution, landmark_cov=marginal_covariances(solution)[0])

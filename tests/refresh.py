@@ -18,6 +18,7 @@ import numpy as np
 from fleet_seif import joint
 from fleet_seif.frame_deltas import quantised
 from fleet_seif.information import FrameDelta
+from fleet_seif.jit import one_thread
 from fleet_seif.joint import JointSolver, Life
 from fleet_seif.records import Floats
 from tests import reference
@@ -168,7 +169,7 @@ def altered(life: Life) -> Life:
     return dataclasses.replace(life, frames=(*life.frames[:-1], dataclasses.replace(last, b=last.b + last.b // 1000)))
 
 
-@joint.one_thread
+@one_thread
 def refreshes(drives: Sequence[Drive], first: int, last: int, *, covariances: bool = False) -> float:
     """Mean milliseconds of a refresh after each new frame, once the cold solution is there."""
     lives = arrivals(drives, first, last)

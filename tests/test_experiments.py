@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 
 from fleet_seif.errors import NumericalError
 from fleet_seif.geometry import act_all, compose, compose_jacobians
-from fleet_seif.joint import one_thread
+from fleet_seif.jit import one_thread
 from fleet_seif.models import COMPASS_XY
 from fleet_seif.records import Floats
 from scenarios.experiments.association import likelihood_errors

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from fleet_seif.config import FilterSettings
-from fleet_seif.joint import one_thread
+from fleet_seif.jit import one_thread
 from fleet_seif.models import innovation, move, sight
 from fleet_seif.records import Floats, Reading
 from fleet_seif.seif import Seif

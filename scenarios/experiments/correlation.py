@@ -16,7 +16,7 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import PowerNorm
 
 from fleet_seif.ekf import Ekf
-from fleet_seif.joint import one_thread
+from fleet_seif.jit import one_thread
 from fleet_seif.records import Floats, Ints
 from fleet_seif.seif import Seif
 from scenarios.experiments import drawing

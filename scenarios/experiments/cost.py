@@ -20,7 +20,7 @@ import numpy as np
 from fleet_seif.config import FilterSettings
 from fleet_seif.ekf import Ekf
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import one_thread
+from fleet_seif.jit import one_thread
 from fleet_seif.records import Floats
 from fleet_seif.seif import Seif
 from scenarios.experiments import drawing, isam2

@@ -19,7 +19,7 @@ from fleet_seif.config import FilterSettings
 from fleet_seif.ekf import Ekf
 from fleet_seif.errors import NumericalError, ReadingRefused
 from fleet_seif.filters import Filter
-from fleet_seif.joint import one_thread
+from fleet_seif.jit import one_thread
 from fleet_seif.records import Floats, Ints, Sightings
 from fleet_seif.seif import Seif
 from scenarios.experiments.study import Progress
