@@ -67,8 +67,8 @@ def test_the_top_level_holds_what_the_user_fixed() -> None:
 def test_joint_solutions_use_one_thread_of_every_library_of_linear_algebra() -> None:
     """In a process of its own: which libraries are found depends on the order of imports."""
     code = (
-        "from fleet_seif.jit import one_thread; import fleet_seif.joint; from threadpoolctl import threadpool_info as i\n"
-        "print([each['num_threads'] for each in one_thread(i)() if each['user_api'] == 'blas'])"
+        "from fleet_seif.jit import one_thread; import fleet_seif.joint; from threadpoolctl import threadpool_info\n"
+        "print([each['num_threads'] for each in one_thread(threadpool_info)() if each['user_api'] == 'blas'])"
     )
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
     assert set(json.loads(told)) == {1}
