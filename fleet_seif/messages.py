@@ -252,8 +252,9 @@ class JointMap:
     landmark_mean (n, 2) m; landmark_cov (n, 2, 2) m^2, empty (0, 2, 2) where none has been computed yet; cov_version:
     the map version that the covariances belong to, -1 for none.
     names: for each landmark, who saw it; signature (n,), -1 unknown. pose_mean (v, 3), pose_cov (v, 3, 3) in the
-    order of `poses`, the names of the placed vehicles. canonical: from checked prefixes only, in
-    canonical order, and so equal on every node that holds the same messages.
+    order of `poses`, the names of the placed vehicles. canonical: from checked prefixes only, solved
+    from nothing in canonical order, and so that of every node that holds the same messages; a live map goes on from the
+    one before.
     """
 
     fleet: str
