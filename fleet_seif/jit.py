@@ -21,6 +21,11 @@ def kernel(function: F) -> F:
     return cast(F, numba.njit(cache=True, error_model="numpy")(function))
 
 
+def long_kernel(function: F) -> F:
+    """The same for one that takes milliseconds and runs beside other threads: it lets go of the interpreter lock."""
+    return cast(F, numba.njit(cache=True, error_model="numpy", nogil=True)(function))
+
+
 def one_thread(function: F) -> F:
     """Run a function with single-threaded BLAS: the same bits on any number of cores, no threads waiting for others."""
     return cast(F, _libraries.wrap(limits=1, user_api="blas")(function))

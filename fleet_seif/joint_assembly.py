@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 
-from fleet_seif.jit import kernel
+from fleet_seif.jit import kernel, long_kernel
 from fleet_seif.joint_frames import Frames, row_of
 from fleet_seif.records import Floats, Ints
 
@@ -116,7 +116,7 @@ def turns_into(turns: Floats, frames: Frames, chosen: Ints, X: Floats) -> None:
         turns[f, 1] = 2.0 * math.pi * math.floor((angle - frames.given[f, 2]) / (2.0 * math.pi) + 0.5)
 
 
-@kernel
+@long_kernel
 def evaluate_into(
     g: Floats, z: Floats, chi_square: Floats, weight: Floats, frames: Frames, chosen: Ints, X: Floats, turns: Floats
 ) -> float:
@@ -167,7 +167,7 @@ def _prior_into(g: Floats, frames: Frames, f: int, X: Floats, turn: float) -> fl
     return cost
 
 
-@kernel
+@long_kernel
 def moved_frames(
     frames: Frames, chosen: Ints, X: Floats, z: Floats, weight: Floats,
     heading_then: Floats, z_then: Floats, weight_then: Floats, tolerance: float,

@@ -321,7 +321,7 @@ class Vehicle:
 
     @property
     def landmarks(self) -> Floats:
-        """Live estimates of the landmarks in the world, m, shape (n, 2); NaN for one whose sightings were all rejected."""
+        """Live estimates of the landmarks in the world, m, shape (n, 2); NaN for one that has turned out to be none."""
         with self._lock:
             return self._core.landmarks
 
