@@ -28,11 +28,11 @@ SETTLED: Final = 1e-13
 ROUNDING: Final = 1e-10
 """Where a step is shorter than this per variable, in sigmas squared, and steps no longer shrink, rounding is all that
 is left."""
-TOLERANCE_FIRST: Final = 1e-3
+TOLERANCE_FIRST: Final = 3e-2
 TOLERANCE_LEAST: Final = 1e-6
 """How far a frame may move before it is linearised anew: its heading in rad, what it sees relative to its size, its
 weight relative."""
-SLOW: Final = 0.03
+SLOW: Final = 0.3
 """A step (in sigmas squared) above this share of the one before is slow: the tolerance becomes a tenth."""
 SLACK: Final = 1e-9
 """What the cost may grow by, relative: rounding."""
