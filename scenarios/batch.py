@@ -11,7 +11,7 @@ by Levenberg-Marquardt; rho is the square, or Huber's where asked. It knows whic
 2. Increments and start poses err as plain numbers (x, y, theta), as they are declared. gtsam's own factors take the
    error's logarithm instead, which bends a forward error sideways: beyond the sideways noise of a vehicle that does
    not slip. So these factors are ours, called back from gtsam. With robust weights, which are for recorded data,
-   gtsam's own do where the bend is below BEND_MAX, at a tenth of the time.
+   gtsam's own do where the bend is below BEND_MAX: they call nothing back.
 3. Dead reckoning is no first estimate: it is off by more than half a turn before a run ends, and Levenberg-Marquardt
    then stays where it starts. So iSAM2 (Kaess et al., IJRR 2012) takes all vehicles through their runs side by side,
    in strides short enough for dead reckoning. Whatever it ends at is where Levenberg-Marquardt begins.
