@@ -35,6 +35,8 @@ class FilterSettings(Settings):
     frames: "single", one frame for the whole run, as published; "adaptive", a frame is closed before its linearisation
     goes wrong: after frame_steps_max steps, frame_landmarks_max landmarks, or once odometry has added up to a standard
     deviation of frame_heading_std_max_rad.
+    frame_huber: standard deviations up to which a sighting counts in full when a frame is closed (Huber's k): for
+    sensors whose errors have heavy tails; none: all that pass the gate do.
     close_lag_steps: steps after which the correction of a closed frame is published.
     localise_steps: steps after which a vehicle of several frames solves them as one system, for its live pose and
     map; in between the open frame's filter goes on alone. Enters nothing that is published.
@@ -56,6 +58,7 @@ class FilterSettings(Settings):
     frame_steps_max: Annotated[int, Field(ge=1, le=10_000)] = 25
     frame_landmarks_max: Annotated[int, Field(ge=2, le=1000)] = 60
     frame_heading_std_max_rad: Positive = 0.5
+    frame_huber: Positive | None = None
     close_lag_steps: Annotated[int, Field(ge=1, le=10_000)] = 2
     localise_steps: Annotated[int, Field(ge=1, le=10_000)] = 5
     landmarks_max: Annotated[int, Field(ge=1, le=10_000_000)] = 32_767

@@ -435,18 +435,17 @@ def cost(model: int, r: Chain, used: Bools, bound: float, x: Floats, y: Floats) 
 
 @kernel
 def optimise_into(
-    x: Floats, y: Floats, tape: Tape, model: int, r: Chain, used: Bools, bound: float, most: int
+    x: Floats, y: Floats, tape: Tape, model: int, r: Chain, used: Bools, bound: float, step_max: float, most: int
 ) -> tuple[int, int, float]:
     """Gauss-Newton from x, y until it stands still, damped where a step raises the cost; `most` linearisations.
 
-    bound: of Huber's cost; infinite for least squares, else a rough solution will do.
+    bound: of Huber's cost; infinite for least squares. step_max: in sigmas squared.
 
     Leaves in x, y the solution, in the tape the linearisation there, undamped. Returns OK or what went wrong, the
     linearisations it took, and chi-square.
     """
     new_x, new_y = x.copy(), y.copy()
     now, damping = cost(model, r, used, bound, x, y), 0.0
-    step_max = STEP_MAX if bound == np.inf else ROUGH_STEP_MAX
     for iteration in range(1, most + 1):
         length = eliminate_into(tape, model, r, used, bound, x, y, damping)
         if not length >= 0.0:
@@ -571,7 +570,9 @@ def marginal(tape: Tape, x: Floats, y: Floats, seen: Bools) -> tuple[Floats, Flo
     return H, b, mean
 
 
-def solve_frame(readings: FrameReadings, poses: Floats, landmarks: Floats, *, gate: float = GATE) -> FrameSolution:
+def solve_frame(
+    readings: FrameReadings, poses: Floats, landmarks: Floats, *, gate: float = GATE, bound: float = math.inf
+) -> FrameSolution:
     """The posterior of a frame from its own readings, without the sightings that contradict the others.
 
     A sighting is tested by its innovation, given all others. Where all pass, that is all. Else a robust solution finds
@@ -580,6 +581,8 @@ def solve_frame(readings: FrameReadings, poses: Floats, landmarks: Floats, *, ga
     Args:
         poses, landmarks: the first guess, (T, 3) and (L, 2), say of the live filter. A landmark without a sighting is
             left as it is.
+        gate: squared innovation beyond which a sighting is rejected.
+        bound: squared normalised residual beyond which one pulls no harder (Huber); H and chi-square have the weights.
 
     Raises:
         ValueError: shapes do not fit, or a number of a pose or landmark is out of range.
@@ -588,11 +591,11 @@ def solve_frame(readings: FrameReadings, poses: Floats, landmarks: Floats, *, ga
     """
     chain, order = _checked(readings, poses, landmarks)
     state = _Estimate(readings.model, chain, poses, landmarks)
-    code = state.solve(ROUGH_ITERATIONS_MAX)
+    code = state.solve(ROUGH_ITERATIONS_MAX, bound)
     if code != OK or state.worst() > gate:
         state = _robust(state, poses, landmarks, gate)
         for again in range(ROUNDS_MAX):
-            code = state.solve(ITERATIONS_MAX)
+            code = state.solve(ITERATIONS_MAX, bound)
             if code != OK:
                 _give_up(code, state.iterations)
             if again == ROUNDS_MAX - 1 or not state.reconsider(gate):
@@ -628,10 +631,10 @@ class _Estimate:
         self.iterations = 0
         self._returned = np.zeros(len(chain.z), np.bool_)
 
-    def solve(self, most: int, bound: float = math.inf) -> int:
+    def solve(self, most: int, bound: float, step_max: float = STEP_MAX) -> int:
         """Solve with what is in use, then test all sightings. Returns OK, or what went wrong."""
         fixed = self.tape, self.model, self.chain, self.used
-        code, count, self.cost = optimise_into(self.x, self.y, *fixed, bound, most)
+        code, count, self.cost = optimise_into(self.x, self.y, *fixed, bound, step_max, most)
         self.iterations += count
         if code != NOT_POSITIVE:
             self.innovation = squared_innovations(*fixed, self.seen(), bound, self.x, self.y)
@@ -672,7 +675,7 @@ def _robust(plain: _Estimate, poses: Floats, landmarks: Floats, gate: float) -> 
     sight, points = (POINT, as_points(chain)) if model == RANGE_BEARING else (model, chain)
     x, y = reckoned(model, chain, landmarks)
     starts = [_Estimate(sight, points, poses, landmarks), _Estimate(sight, points, x[1:], y)]
-    codes = [start.solve(ROUGH_ITERATIONS_MAX, HUBER) for start in starts]
+    codes = [start.solve(ROUGH_ITERATIONS_MAX, HUBER, ROUGH_STEP_MAX) for start in starts]
     best = min(
         (start for start, code in zip(starts, codes) if code != NOT_POSITIVE),
         key=lambda start: start.cost,
@@ -685,7 +688,7 @@ def _robust(plain: _Estimate, poses: Floats, landmarks: Floats, gate: float) -> 
     best.keep(best.innovation <= gate)
     if model == RANGE_BEARING:
         best.model, best.chain = model, chain
-        best.solve(ROUGH_ITERATIONS_MAX, HUBER)
+        best.solve(ROUGH_ITERATIONS_MAX, HUBER, ROUGH_STEP_MAX)
         best.keep(best.innovation <= gate)
     return best
 

@@ -12,6 +12,7 @@
 """
 
 import logging
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -82,8 +83,10 @@ class FrameLog:
             heading_variance=heading_variance,
         )  # fmt: skip
 
-    def solved(self, model: int, signatures: Ints, landmarks: Floats) -> FrameSolution:
+    def solved(self, model: int, signatures: Ints, landmarks: Floats, huber: float | None) -> FrameSolution:
         """The batch over these readings, from the live estimates on; signatures of its landmarks (n,), m (n, 2).
+
+        huber: see FilterSettings.frame_huber.
 
         Raises NumericalError.
         """
@@ -99,7 +102,8 @@ class FrameLog:
             z=np.concatenate([*(z for _, _, z, _ in self.sightings), none.z]),
             cov=np.concatenate([*(Z for _, _, _, Z in self.sightings), none.cov]),
         )
-        return solve_frame(readings, np.array([pose for _, _, pose in self.motions]).reshape(-1, 3), landmarks)
+        poses = np.array([pose for _, _, pose in self.motions]).reshape(-1, 3)
+        return solve_frame(readings, poses, landmarks, bound=math.inf if huber is None else huber**2)
 
 
 @dataclass
@@ -274,7 +278,7 @@ class FramedFilter:
             return []
         total = self.totals[closed.frame]
         try:
-            batch = closed.log.solved(self.model, closed.signatures, closed.landmarks)
+            batch = closed.log.solved(self.model, closed.signatures, closed.landmarks, self.settings.frame_huber)
             order = np.argsort(closed.numbers)
             order = order[batch.seen[order]]
             rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])

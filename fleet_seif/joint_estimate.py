@@ -4,11 +4,14 @@
    has moved by more than a tolerance, so far from what is new nothing is redone. Where the estimate settles, the
    gradient is zero, whatever the factor's age: staleness costs iterations, not accuracy. Where steps shrink slowly the
    tolerance shrinks.
-2. A step that raises the cost is not taken: first all frames are linearised anew, then the step is damped
+2. A step beyond which the cost rises again is shortened to where its slope, taken as a straight line between both ends,
+   is zero. Frames that contradict the others by metres (a barcode misread several times) bend the cost more than
+   Gauss-Newton knows; where damping would hold back the whole map for them, this does not.
+3. A step that still raises the cost is not taken: first all frames are linearised anew, then the step is damped
    (Levenberg): the diagonal grows by a share that is tenfold after each failure and a tenth after each success.
-3. Whole turns of headings are chosen where `settle` begins and stay: were they chosen at each step, the cost would
+4. Whole turns of headings are chosen where `settle` begins and stay: were they chosen at each step, the cost would
    jump where a frame is half a turn off, and no step would bring it down.
-4. Frames that are taken in are placed from where their first pose is and what they saw; what is known stays.
+5. Frames that are taken in are placed from where their first pose is and what they saw; what is known stays.
 """
 
 from collections.abc import Sequence
@@ -34,6 +37,8 @@ TOLERANCE_LEAST: Final = 1e-6
 weight relative."""
 SLOW: Final = 0.3
 """A step (in sigmas squared) above this share of the one before is slow: the tolerance becomes a tenth."""
+OVERSHOT: Final = 0.5
+"""A step is too long where the cost's slope at its end is this share of that at its beginning, and points back."""
 SLACK: Final = 1e-9
 """What the cost may grow by, relative: rounding."""
 DAMPING_FIRST: Final = 1e-4
@@ -158,6 +163,10 @@ class Estimate:
             if not np.isfinite(length):
                 raise NumericalError("the joint map has no finite solution: information of frames is too lopsided")
             then = self._evaluate(self.X + step, active, turns)
+            back = -float(np.vdot(then.g, step))
+            if back > OVERSHOT * length:
+                then = self._evaluate(self.X + length / (length + back) * step, active, turns)
+                tolerance = TOLERANCE_LEAST
             short = length * (1.0 + self.damping) ** 2 <= enough
             short |= length <= ROUNDING * len(self.X) and length > 0.9 * last and not self.damping
             if then.cost <= now.cost * (1.0 + SLACK) + SLACK or short:

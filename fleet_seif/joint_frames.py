@@ -24,9 +24,10 @@ DENSE_ROWS_MAX: Final = 200
 """Rows of a frame up to which its own mean is found with a dense factor."""
 PIECE_VARIABLES_MAX: Final = 64
 """Variables of a frame up to which it stays in one piece."""
-HUBER_DEVIATES: Final = 6.0
-"""Where robust weights begin: this many standard deviates up the chi-square distribution of a frame's rows. A frame of
-15 landmarks is weighted down from 3.3 per row on; of frames whose noise is as declared, about one in 10^9 would be."""
+HUBER_DEVIATES: Final = 1.0
+"""Where robust weights begin: this many standard deviates up the chi-square distribution of a frame's rows. Of frames
+whose noise is as declared one in six is weighted down, by a little: no loss was seen (three_air_vehicles, both noises, 4 seeds).
+On MR.CLAM 6 the landmark error is 0.163 m instead of 0.196 m with 6 deviates."""
 
 
 class SparseFactor:

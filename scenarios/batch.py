@@ -10,7 +10,8 @@ by Levenberg-Marquardt; rho is the square, or Huber's where asked. It knows whic
    pose's in its own tangent space. A given start pose is a constant and has no rows.
 2. Increments and start poses err as plain numbers (x, y, theta), as they are declared. gtsam's own factors take the
    error's logarithm instead, which bends a forward error sideways: beyond the sideways noise of a vehicle that does
-   not slip. So these factors are ours, called back from gtsam.
+   not slip. So these factors are ours, called back from gtsam. With robust weights, which are for recorded data,
+   gtsam's own do where the bend is below BEND_MAX: they call nothing back.
 3. Dead reckoning is no first estimate: it is off by more than half a turn before a run ends, and Levenberg-Marquardt
    then stays where it starts. So iSAM2 (Kaess et al., IJRR 2012) takes all vehicles through their runs side by side,
    in strides short enough for dead reckoning. Whatever it ends at is where Levenberg-Marquardt begins.
@@ -49,6 +50,8 @@ FILTERING: Final = "first estimate, %"
 ITERATING: Final = "iterations"
 STAGES: Final = {FILTERING: 100, ITERATING: ITERATIONS_MAX}
 """What `solve_batch` tells its progress of, with how much there is of each."""
+BEND_MAX: Final = 0.5
+"""Standard deviations that an error of one standard deviation forward and one in heading may be bent by."""
 TOLERANCE: Final = 1e-9
 REMEDY: Final = "remedy: robust weights (--robust), or another start"
 POSE_KEYS: Final = 2**40
@@ -188,7 +191,8 @@ class _Problem:
         for vehicle, log in enumerate(self._logs):
             (whole if _is_given(log) else graph).add(self._start_factor(vehicle))
             for step in range(1, log.steps + 1):
-                graph.add(self._motion_factor(vehicle, step))
+                own = self._kernel is not None and _bend(log.odometry_cov[step - 1]) <= BEND_MAX
+                graph.add(self._rough_factor(vehicle, step) if own else self._motion_factor(vehicle, step))
             for i, key in enumerate(np.searchsorted(self._signatures, log.sighting_signature).tolist()):
                 graph.add(self._sighting_factor(vehicle, i, key))
         whole.push_back(graph)
@@ -273,7 +277,7 @@ class _Problem:
         return self._gtsam.CustomFactor(noise, [a, b], error)
 
     def _rough_factor(self, vehicle: int, step: int) -> Any:
-        """A factor of gtsam's own for the pose of a step: faster, and only for where to begin.
+        """A factor of gtsam's own for the pose of a step: faster, and right where errors bend little.
 
         It measures in the frame of the pose that is reached, our covariance is in the frame of the one left.
         """
@@ -334,6 +338,15 @@ def _is_given(log: Log) -> bool:
 
 def _pose_key(vehicle: int, step: int) -> int:
     return (vehicle + 1) * POSE_KEYS + step
+
+
+def _bend(cov: Floats) -> float:
+    """How far the logarithm moves an error of one standard deviation each way, in standard deviations.
+
+    An error (x, y, theta) becomes (x + y theta / 2, y - x theta / 2, theta) to second order.
+    """
+    x, y, theta = np.sqrt(np.diag(cov)).tolist()
+    return float(0.5 * theta * max(x / y, y / x))
 
 
 def _turned_back(cov: Floats, angle_rad: float) -> Floats:

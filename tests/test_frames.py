@@ -144,7 +144,7 @@ def test_it_goes_on_from_its_state_to_the_bit(at: int) -> None:
 
 
 def test_where_the_batch_fails_the_filters_posterior_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*arguments: object) -> None:
+    def fails(*arguments: object, **options: object) -> None:
         raise NumericalError("no")
 
     monkeypatch.setattr(frames_module, "solve_frame", fails)

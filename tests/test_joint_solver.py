@@ -176,8 +176,8 @@ def contradicted(by_m: float) -> tuple[list[Life], Classes]:
 @pytest.mark.parametrize("by_m", [1.0, 10.0])
 def test_a_frame_that_contradicts_the_others_is_weighted_down_alone(by_m: float) -> None:
     clean, solution = solve(*contradicted(0.0)), solve(*contradicted(by_m))
-    assert np.array_equal(clean.weight, np.ones(3 * FRAMES))
-    down = {solution.frames[f] for f in np.flatnonzero(solution.weight < 1.0).tolist()}
+    assert clean.weight.min() > 0.9
+    down = {solution.frames[f] for f in np.flatnonzero(solution.weight < 0.9).tolist()}
     assert down == {("v1", 0, FRAMES - 1)}
     assert solution.weight.min() < 0.6
     n = 2 * len(solution.classes)
