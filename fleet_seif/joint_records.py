@@ -8,7 +8,7 @@ import scipy.sparse
 
 from fleet_seif.information import FrameDelta
 from fleet_seif.joint_assembly import Evaluation, assembled
-from fleet_seif.joint_frames import Frames
+from fleet_seif.joint_frames import DOUBTFUL, Frames
 from fleet_seif.joint_tree import Piece
 from fleet_seif.messages import LandmarkName
 from fleet_seif.records import Floats, Ints
@@ -77,6 +77,11 @@ class JointSolution:
     def b(self) -> Floats:
         """H mean (n,)."""
         return np.asarray(self.H @ self.mean)
+
+    @property
+    def doubtful(self) -> Ints:
+        """Frames that disagree with the others, ascending."""
+        return np.flatnonzero(self.weight < DOUBTFUL)
 
     @property
     def landmark_mean(self) -> Floats:

@@ -128,7 +128,7 @@ class MapMaker:
             self._covariances = covariances
         elif (covariances.classes, covariances.poses) != (classes, tuple(newest)):
             covariances = Covariances()
-        doubtful = int(np.count_nonzero(solution.weight < 1.0))
+        doubtful = len(solution.doubtful)
         return JointMap(
             fleet=taken.fleet,
             node=taken.node,

@@ -70,7 +70,6 @@ def evaluate(run: FinishedRun) -> Outcome:
 
 def _frames(solution: JointSolution) -> dict[str, Any]:
     """How many frames the map is made of, and those that disagree with the others so much that they count less."""
-    doubtful = np.flatnonzero(solution.weight < 1.0).tolist()
     return {
         "count": len(solution.frames),
         "weighted_down": [
@@ -81,7 +80,7 @@ def _frames(solution: JointSolution) -> dict[str, Any]:
                 "weight": float(solution.weight[f]),
                 "chi_square_per_row": float(solution.chi_square[f] / solution.dof[f]),
             }
-            for f in doubtful
+            for f in solution.doubtful.tolist()
         ],
     }
 
