@@ -83,6 +83,8 @@ class MapMaker:
         self._solver = JointSolver()
         self._covariances = Covariances()
         self._is_first = True
+        self.replay_s = 0.0
+        """How long the last solution from nothing took."""
 
     def make(self, taken: MapInput, version: int, *, final: bool, replay: bool = False) -> JointMap:
         """Solve: everything folded if that is positive definite, what has been checked otherwise and at the end.
@@ -114,7 +116,10 @@ class MapMaker:
                 map_digest=taken.map_digest, ledger_digest=taken.ledger_digest, vehicles=taken.vehicles,
                 counters=taken.counters,
             )  # fmt: skip
+        begin = self._clock()
         solution = self._solver.replay(lives, classes) if canonical else self._solver.update(lives, classes)
+        if canonical:
+            self.replay_s = self._clock() - begin
         self._is_first = False
         newest = {vehicle: i for i, (vehicle, _, k) in enumerate(solution.poses) if k < 0}  # of several lives, the last
         rows = list(newest.values())

@@ -262,6 +262,7 @@ def _write_fusion(path: Path, core: FusionCore, service: FusionService) -> None:
             "maps_served": service.statistics.maps,
             "map_behind_s_p99": service.behind_p99_s(),
             "solve_s_p50": float(np.median(service.statistics.solve_s)) if service.statistics.solve_s else None,
+            "final_map_s": service.statistics.final_s,
             "inbox_dropped": service.dropped,
             **core.counters,
         },

@@ -122,6 +122,7 @@ def test_joint_map_is_solved_from_nothing_to_the_same_bits() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(("number", "absolute_m", "aligned_m"), [(2, 0.09, 0.03), (6, 0.19, 0.045)])
 def test_five_real_robots_do_not_diverge(
     number: int, absolute_m: float, aligned_m: float, tmp_path_factory: pytest.TempPathFactory

@@ -65,6 +65,7 @@ def test_bytes_per_step_stay_flat_from_50_to_5000_landmarks() -> None:
     assert max(rows.values()) < 1.5 * min(rows.values())
 
 
+@pytest.mark.timeout(300)
 def test_twenty_vehicles_at_ten_hertz_leave_no_gap_and_a_fresh_map(tmp_path: Path) -> None:
     settings = ["fleet.vehicles=20", "world.landmarks=340", "world.steps=200", "run.rate_hz=10"]
     arguments = [part for item in settings for part in ("--set", item)]

@@ -110,6 +110,7 @@ def test_making_messages_durable_keeps_a_fifth_of_the_rate(tmp_path: Path) -> No
     assert found > plain / 5
 
 
+@pytest.mark.timeout(300)
 def test_ten_vehicles_at_twenty_hertz_for_a_minute_leave_no_gap_and_a_fresh_map(tmp_path: Path) -> None:
     settings = ("fleet.vehicles=10", "world.landmarks=170", "world.steps=1200", "run.rate_hz=20")
     arguments = [part for item in settings for part in ("--set", item)]
