@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import JointSolver, Life, marginal_covariances, solve
+from fleet_seif.joint import JointSolution, JointSolver, Life, marginal_covariances, solve
 from fleet_seif.messages import JointMap, LandmarkName, VehicleState
 from fleet_seif.records import Floats
 from fusion.core import FusionCore
@@ -74,8 +74,9 @@ class MapMaker:
 
     1. A map goes on from the one before (fleet_seif.joint_solver). A final one, a first one, and one that is asked for
        as a `replay` is solved from nothing; if it rests on checked prefixes it is canonical.
-    2. Covariances have a cadence of their own: a map has them unless that would take more than a fifth of the time. In
-       between it carries the last ones as long as it has the same landmarks, with the version they belong to.
+    2. Covariances have a cadence of their own, a fifth of the time: `with_covariances` adds them to a map that has been
+       served already. Maps in between carry the last ones as long as they have the same landmarks, with the version
+       they belong to. The first map and a final one have their own.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -83,6 +84,7 @@ class MapMaker:
         self._solver = JointSolver()
         self._covariances = Covariances()
         self._is_first = True
+        self._solution: JointSolution | None = None
         self.replay_s = 0.0
         """How long the last solution from nothing took."""
 
@@ -110,6 +112,7 @@ class MapMaker:
     def _solved(
         self, taken: MapInput, lives: tuple[Life, ...], classes: Classes, version: int, *, final: bool, canonical: bool
     ) -> JointMap:
+        self._solution = None
         if not lives:  # nothing yet, but who has been heard and what has been counted
             return dataclasses.replace(
                 empty_map(taken.fleet, taken.node, version), canonical=canonical, final=final,
@@ -120,21 +123,11 @@ class MapMaker:
         solution = self._solver.replay(lives, classes) if canonical else self._solver.update(lives, classes)
         if canonical:
             self.replay_s = self._clock() - begin
-        self._is_first = False
-        newest = {vehicle: i for i, (vehicle, _, k) in enumerate(solution.poses) if k < 0}  # of several lives, the last
-        rows = list(newest.values())
-        covariances = self._covariances
-        if final or self._clock() >= covariances.due_s:
-            begin = self._clock()
-            landmarks, poses = marginal_covariances(solution)
-            spent = self._clock() - begin
-            due_s = self._clock() + COVARIANCE_PAUSE * spent
-            covariances = Covariances(version, classes, tuple(newest), landmarks, poses[rows], due_s)
-            self._covariances = covariances
-        elif (covariances.classes, covariances.poses) != (classes, tuple(newest)):
+        newest, rows = list(_newest(solution)), list(_newest(solution).values())
+        covariances, doubtful = self._covariances, len(solution.doubtful)
+        if (covariances.classes, covariances.poses) != (classes, tuple(newest)):
             covariances = Covariances()
-        doubtful = len(solution.doubtful)
-        return JointMap(
+        made = JointMap(
             fleet=taken.fleet,
             node=taken.node,
             version=version,
@@ -153,11 +146,33 @@ class MapMaker:
             vehicles=taken.vehicles,
             counters={**taken.counters, WEIGHTED_DOWN: doubtful} if doubtful else taken.counters,
         )
+        self._solution, is_first, self._is_first = solution, self._is_first, False
+        return self.with_covariances(made, version) if final or is_first else made
+
+    @property
+    def are_covariances_due(self) -> bool:
+        return self._solution is not None and self._clock() >= self._covariances.due_s
+
+    def with_covariances(self, newest: JointMap, version: int) -> JointMap:
+        """The map that was made last, as this version, with covariances of its own."""
+        solution, begin = self._solution, self._clock()
+        assert solution is not None
+        landmarks, poses = marginal_covariances(solution)
+        poses = poses[list(_newest(solution).values())]
+        spent = self._clock() - begin
+        due_s = self._clock() + COVARIANCE_PAUSE * spent
+        self._covariances = Covariances(version, newest.names, newest.poses, landmarks, poses, due_s)
+        return dataclasses.replace(newest, version=version, landmark_cov=landmarks, pose_cov=poses, cov_version=version)
 
 
 def make_map(taken: MapInput, version: int, *, final: bool) -> JointMap:
     """One map, from nothing. Raises NumericalError where nothing can be solved."""
     return MapMaker().make(taken, version, final=final)
+
+
+def _newest(solution: JointSolution) -> dict[str, int]:
+    """The row of each vehicle's newest pose; of several lives, the last one's."""
+    return {vehicle: i for i, (vehicle, _, k) in enumerate(solution.poses) if k < 0}
 
 
 def _that_can_be_solved(lives: tuple[Life, ...], classes: Classes) -> tuple[Life, ...]:

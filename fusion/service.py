@@ -36,6 +36,7 @@ BURST_S = 0.01  # nobody waits longer than this, and a stride, for effects of wh
 STRIDE = 16
 TICK_S = 0.02
 PROGRESS_S = 0.2
+PAUSE_S = 0.02  # between two maps at least
 LINGER_S = 30.0
 
 Event = Callable[[], list[Effect]]
@@ -238,8 +239,9 @@ class FusionService:
     def _solve_for_ever(self) -> None:
         """Serve a map when there is news: something folded, or a vehicle that fell silent or came back. Where there is
         none for as long as a solution from nothing takes, the last one is solved so and is canonical."""
-        quiet_since_s = self._clock()
-        while not self._over.wait(self._settings.map_s):
+        quiet_since_s = next_s = self._clock()
+        while not self._over.wait(max(PAUSE_S, next_s - self._clock())):
+            next_s = self._clock() + self._settings.map_s
             try:
                 with self._lock:
                     stalled = [state.stalled for state in self._core.states(self._clock())]
@@ -249,6 +251,8 @@ class FusionService:
                 if self._core.changed or news or not self._served:
                     self._serve(final=False)
                     quiet_since_s = self._clock()
+                    if self._maker.are_covariances_due:
+                        self._publish_map(self._maker.with_covariances(self.newest, self.newest.version + 1))
                 elif not old.canonical and not self._replayed and self._clock() >= quiet_since_s + self._maker.replay_s:
                     self._serve(final=False, replay=True)
             except NumericalError as error:
@@ -274,12 +278,16 @@ class FusionService:
         self.statistics.solve_s.append(time.perf_counter() - begin)
         if final:
             self.statistics.final_s = self.statistics.solve_s[-1]
-        self.newest, self._replayed = newest, replay
+        self._replayed = replay
+        self._publish_map(newest)
+        if changed_at_s is not None and not final:
+            self.statistics.behind_s.append(self._clock() - changed_at_s)
+
+    def _publish_map(self, newest: JointMap) -> None:
+        self.newest = newest
         self._served = encode_map(newest, self._signer)
         self._publish()
         self.statistics.maps += 1
-        if changed_at_s is not None and not final:
-            self.statistics.behind_s.append(self._clock() - changed_at_s)
 
     def _publish(self) -> None:
         for piece in map_pieces(self._served, self._core.node, self.newest.version):
