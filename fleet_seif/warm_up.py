@@ -32,7 +32,7 @@ def warm_up(
     """
     begin = time.perf_counter()
     notice = threading.Timer(
-        PATIENCE_S, say, ["compiling numerical kernels (first run after an installation, up to a minute) ..."]
+        PATIENCE_S, say, ["compiling numerical kernels (first run after an installation, a minute or two) ..."]
     )
     notice.daemon = True
     notice.start()
