@@ -96,6 +96,8 @@ def drive(
             time.sleep(max(0.0, begin + (step - done) / rate_hz - time.monotonic()))
         elif not vehicle.wait_for_room(SILENCE_S):
             raise _silence()
+        if not rate_hz:
+            vehicle.localise()
         try:
             vehicle.step(reading.odometry, reading.odometry_cov, reading.sightings, time_s=reading.time_s)
         except (ReadingRefused, NumericalError) as error:

@@ -171,11 +171,14 @@ class Vehicle:
             self._moved.clear()
             if self._closing:
                 return
-            self._localise()
+            self.localise()
 
-    def _localise(self) -> None:
-        """Solve the vehicle's own frames if that is due; the caller does not hold the lock, so that steps go on."""
-        with self._solving:
+    def localise(self) -> None:
+        """Solve the vehicle's own frames if that is due, or wait for the thread that does; other steps may go on.
+
+        Not needed by a robot that moves in its own time: the thread follows it.
+        """
+        with self._solving:  # without the lock of the core, so that steps go on
             framed = self._core.filter
             with self._lock:
                 life = framed.own_life() if framed.is_localisation_due else None
@@ -258,7 +261,7 @@ class Vehicle:
         if due and self._threads:
             self._moved.set()
         elif due:
-            self._localise()
+            self.localise()
         return result
 
     def _time(self, time_s: float | None) -> float:
@@ -270,7 +273,7 @@ class Vehicle:
             self._check()
             self._core.end()
             self._hand_over()
-        self._localise()
+        self.localise()
 
     def wait_for_room(self, timeout_s: float | None = None) -> bool:
         """Wait until fewer than `publish.window` messages are unacknowledged. False after the timeout."""
