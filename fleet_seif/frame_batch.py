@@ -29,6 +29,7 @@ from fleet_seif.geometry import between, wrap
 from fleet_seif.jit import kernel
 from fleet_seif.models import COMPASS_XY, RANGE_BEARING, heading_column, move, place, sight_numbers
 from fleet_seif.records import Floats, Ints
+from fleet_seif.robust import huber
 
 Bools = NDArray[np.bool_]
 
@@ -243,11 +244,8 @@ def look(
 
 @kernel
 def softened(r0: float, r1: float, W: Floats, bound: float) -> tuple[float, float]:
-    """Huber's cost of a residual, and its weight: v = r' W r and 1 up to `bound`, beyond 2 sqrt(bound v) - bound."""
-    v = r0 * r0 * W[0, 0] + 2.0 * r0 * r1 * W[0, 1] + r1 * r1 * W[1, 1]
-    if v <= bound:
-        return v, 1.0
-    return 2.0 * math.sqrt(bound * v) - bound, math.sqrt(bound / v)
+    """Huber's cost of a residual, and its weight, of r' W r."""
+    return huber(r0 * r0 * W[0, 0] + 2.0 * r0 * r1 * W[0, 1] + r1 * r1 * W[1, 1], bound)
 
 
 @kernel

@@ -26,6 +26,7 @@ import scipy.sparse
 from fleet_seif.jit import kernel, long_kernel
 from fleet_seif.joint_frames import Frames, row_of
 from fleet_seif.records import Floats, Ints
+from fleet_seif.robust import huber
 
 
 class Evaluation(NamedTuple):
@@ -141,10 +142,8 @@ def evaluate_into(
         for i in range(n):
             chi += r[i] * q[i]
         limit = frames.limit[f]
-        chi_square[f], weight[f] = chi, 1.0
-        if chi > limit:
-            weight[f] = math.sqrt(limit / chi)
-            chi = 2.0 * math.sqrt(limit * chi) - limit
+        chi_square[f] = chi
+        chi, weight[f] = huber(chi, limit)
         cost += chi
         for i in range(n):
             q[i] *= weight[f]

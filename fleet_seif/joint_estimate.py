@@ -47,7 +47,7 @@ DAMPING_MAX: Final = 1e9
 
 
 class Estimate:
-    """See the rules above. X (v, 3): the state by joint variable; `known`: 1 where a variable has a value."""
+    """See the rules above. X (v, 3): the state by joint variable."""
 
     def __init__(self, registry: Registry) -> None:
         self.registry = registry

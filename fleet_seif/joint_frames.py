@@ -19,17 +19,12 @@ from fleet_seif.errors import NumericalError
 from fleet_seif.information import B_QUANTUM, H_QUANTUM, POSE, FrameDelta, block_size, to_information
 from fleet_seif.jit import kernel
 from fleet_seif.records import Floats, Ints
+from fleet_seif.robust import huber_limit
 
 DENSE_ROWS_MAX: Final = 200
 """Rows of a frame up to which its own mean is found with a dense factor."""
 PIECE_VARIABLES_MAX: Final = 64
 """Variables of a frame up to which it stays in one piece."""
-DOUBTFUL: Final = 0.5
-"""Weight below which a frame is shown as one that disagrees: its chi-square is four times where weights begin."""
-HUBER_DEVIATES: Final = 1.0
-"""Where robust weights begin: this many standard deviates up the chi-square distribution of a frame's rows. Of frames
-whose noise is as declared one in six at most is weighted down, a little: over 20 seeds nothing is lost (MATHS.md 18).
-On MR.CLAM 6 the landmark error is 0.163 m instead of 0.196 m with 6 deviates."""
 
 
 class SparseFactor:
@@ -194,15 +189,6 @@ NO_FRAME: Final = FrameRecord(
     0.0, 0.0,
 )  # fmt: skip
 """A frame without variables: what carries the prior of a start pose before its life has a frame."""
-
-
-def huber_limit(dof: int, deviates: float = HUBER_DEVIATES) -> float:
-    """The chi-square of `dof` degrees of freedom that far up (Wilson and Hilferty): dof (1 - v + deviates sqrt(v))^3
-    with v = 2 / (9 dof)."""
-    if not dof:
-        return 0.0
-    variance = 2.0 / (9.0 * dof)
-    return dof * (1.0 - variance + deviates * math.sqrt(variance)) ** 3
 
 
 @dataclass(frozen=True, eq=False)

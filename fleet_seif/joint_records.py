@@ -8,10 +8,11 @@ import scipy.sparse
 
 from fleet_seif.information import FrameDelta
 from fleet_seif.joint_assembly import Evaluation, assembled
-from fleet_seif.joint_frames import DOUBTFUL, Frames
+from fleet_seif.joint_frames import Frames
 from fleet_seif.joint_tree import Piece
 from fleet_seif.messages import LandmarkName
 from fleet_seif.records import Floats, Ints
+from fleet_seif.robust import DOUBTFUL
 
 Classes = tuple[tuple[LandmarkName, ...], ...]
 

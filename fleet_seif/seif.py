@@ -36,6 +36,7 @@ _KINDS = {"seif": kernels.SEIF, "eif": kernels.EIF, "eseif": kernels.ESEIF}
 _STRENGTHS = {"normalised": NORMALISED, "raw": RAW, "kl": KL}
 
 Taken = tuple[Floats, Floats, Floats, Floats, Ints]
+"""Odometry and its covariance, sightings and theirs, signatures."""
 
 
 class Seif:
@@ -44,6 +45,8 @@ class Seif:
     Args:
         model: one of fleet_seif.models. life: numbers of landmarks in what is published, where they are not the
             filter's own; they, `first_new` and `new` are then those of the life.
+
+    called (n,): those numbers. taken: copies of what the last step was given.
     """
 
     def __init__(self, settings: FilterSettings, model: int = RANGE_BEARING, life: Names | None = None) -> None:

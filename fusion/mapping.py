@@ -11,7 +11,8 @@ import numpy as np
 
 from fleet_seif.errors import NumericalError
 from fleet_seif.joint import JointSolution, JointSolver, Life, marginal_covariances, solve
-from fleet_seif.messages import JointMap, LandmarkName, VehicleState
+from fleet_seif.joint_records import Classes
+from fleet_seif.messages import JointMap, VehicleState
 from fleet_seif.records import Floats
 from fusion.core import FusionCore
 
@@ -19,7 +20,6 @@ LEFT_OUT = "lives_left_out"
 WEIGHTED_DOWN = "frames_weighted_down"
 COVARIANCE_PAUSE = 4.0
 """Time between two computations of covariances, in the time that one takes."""
-Classes = tuple[tuple[LandmarkName, ...], ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,7 +123,8 @@ class MapMaker:
         solution = self._solver.replay(lives, classes) if canonical else self._solver.update(lives, classes)
         if canonical:
             self.replay_s = self._clock() - begin
-        newest, rows = list(_newest(solution)), list(_newest(solution).values())
+        newest = _newest(solution)
+        rows = list(newest.values())
         covariances, doubtful = self._covariances, len(solution.doubtful)
         if (covariances.classes, covariances.poses) != (classes, tuple(newest)):
             covariances = Covariances()

@@ -21,13 +21,14 @@ from scenarios import chaos_runs, children, output, tools, watch
 from scenarios.access import Kind
 from scenarios.batch import STAGES
 from scenarios.config import ScenarioError, load_scenario, shipped
-from scenarios.evaluate import read_run, score_run, score_table, score_with_batch
+from scenarios.evaluate import score_run, score_table, score_with_batch
 from scenarios.experiments.names import EXPERIMENTS, find_experiment, run_experiment, summary_table
 from scenarios.experiments.study import png_of, summary_of
 from scenarios.launch import run_processes
 from scenarios.progress import progress_bars
 from scenarios.report import evaluate, write_folder
 from scenarios.source import check_names, record
+from scenarios.stored_run import read_run
 from scenarios.table import report_table
 from scenarios.virtual import run_virtual
 

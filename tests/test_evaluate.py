@@ -11,9 +11,10 @@ import pytest
 
 from scenarios import batch, evaluate, output
 from scenarios.batch import solve_batch
-from scenarios.evaluate import fused_map, map_errors, pose_errors, ratio_to_batch, read_run, score_run, score_with_batch
+from scenarios.evaluate import fused_map, map_errors, pose_errors, ratio_to_batch, score_run, score_with_batch
 from scenarios.report import FinishedRun, write_folder
 from scenarios.report import evaluate as evaluate_run
+from scenarios.stored_run import read_run
 from tests.fleets import run_virtual
 from tests.processes import invoke, refused
 

@@ -23,11 +23,11 @@ from fleet_seif.joint import (
 )
 from fleet_seif.joint_assembly import assembled
 from fleet_seif.joint_estimate import Estimate
-from fleet_seif.joint_frames import huber_limit
 from fleet_seif.joint_records import Classes
 from fleet_seif.joint_registry import Records, Registry
 from fleet_seif.messages import LandmarkName
 from fleet_seif.records import Floats
+from fleet_seif.robust import huber_limit
 from tests.refresh import Drive, fleet, frame_information
 from tests.strategies import settled
 

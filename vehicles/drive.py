@@ -94,9 +94,9 @@ def drive(
             break
         if rate_hz:
             time.sleep(max(0.0, begin + (step - done) / rate_hz - time.monotonic()))
-        elif not vehicle.wait_for_room(SILENCE_S):
-            raise _silence()
-        if not rate_hz:
+        else:
+            if not vehicle.wait_for_room(SILENCE_S):
+                raise _silence()
             vehicle.localise()
         try:
             vehicle.step(reading.odometry, reading.odometry_cov, reading.sightings, time_s=reading.time_s)
