@@ -39,12 +39,13 @@ def invoke(*arguments: str) -> Result:
 
 
 def refused(code: int, *arguments: str) -> str:
-    """What a command says, run in this process, that is refused: a sentence, no traceback."""
+    """What a command says, run in this process, that is refused: a sentence, no traceback; without the box round it,
+    which breaks lines where the paths in them end."""
     done = invoke(*arguments)
     assert done.exit_code == code, (done.output, done.stderr, done.exception)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     assert "Traceback" not in done.stderr
-    return " ".join(done.stderr.split())
+    return " ".join(done.stderr.replace("│", " ").split())
 
 
 class Child:
