@@ -21,8 +21,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 
+from fleet_seif.errors import NumericalError
 from fleet_seif.jit import kernel, long_kernel
 from fleet_seif.joint_frames import Frames, row_of
 from fleet_seif.records import Floats, Ints
@@ -55,7 +57,7 @@ def view_into(z: Floats, frames: Frames, f: int, X: Floats) -> None:
     tx, ty, angle = _pose_of(frames, f, X)
     c, s = math.cos(angle), math.sin(angle)
     row = frames.first_row[f]
-    for v in range(frames.first_variable[f], frames.first_variable[f + 1]):
+    for v in range(frames.first_variable[f], frames.end_variable[f]):
         x = X[frames.variable[v]]
         dx, dy = x[0] - tx, x[1] - ty
         z[row], z[row + 1] = c * dx + s * dy, -s * dx + c * dy
@@ -69,7 +71,7 @@ def view_into(z: Floats, frames: Frames, f: int, X: Floats) -> None:
 def _times_into(q: Floats, frames: Frames, f: int, r: Floats) -> None:
     """q = H_f r."""
     q[:] = 0.0
-    for k in range(frames.first_block[f], frames.first_block[f + 1]):
+    for k in range(frames.first_block[f], frames.end_block[f]):
         p, o, at = frames.rows[k], frames.cols[k], frames.starts[k]
         i, j = row_of(p), row_of(o)
         for a in range(3 if p == 0 else 2):
@@ -88,7 +90,7 @@ def _pull_into(g: Floats, frames: Frames, f: int, X: Floats, q: Floats) -> None:
     c, s = math.cos(angle), math.sin(angle)
     first, start = frames.first_variable[f], frames.start[f]
     row = 0
-    for v in range(first, frames.first_variable[f + 1]):
+    for v in range(first, frames.end_variable[f]):
         i = frames.variable[v]
         u, w = c * q[row] - s * q[row + 1], s * q[row] + c * q[row + 1]
         turn = (X[i, 0] - tx) * w - (X[i, 1] - ty) * u
@@ -111,7 +113,7 @@ def turns_into(turns: Floats, frames: Frames, chosen: Ints, X: Floats) -> None:
     for f in chosen:
         t, first, row = frames.start[f], frames.first_variable[f], frames.first_row[f]
         angle = frames.given[f, 2] if t < 0 else X[t, 2]
-        if frames.first_variable[f + 1] > first:
+        if frames.end_variable[f] > first:
             ahead = X[frames.variable[first], 2] - angle - frames.mean[row + 2]
             turns[f, 0] = 2.0 * math.pi * math.floor(ahead / (2.0 * math.pi) + 0.5)
         turns[f, 1] = 2.0 * math.pi * math.floor((angle - frames.given[f, 2]) / (2.0 * math.pi) + 0.5)
@@ -127,10 +129,10 @@ def evaluate_into(
     """
     most = 0
     for f in chosen:
-        most = max(most, frames.first_row[f + 1] - frames.first_row[f])
+        most = max(most, frames.end_row[f] - frames.first_row[f])
     r, q, cost = np.empty(most), np.empty(most), 0.0
     for f in chosen:
-        begin, end = frames.first_row[f], frames.first_row[f + 1]
+        begin, end = frames.first_row[f], frames.end_row[f]
         n = end - begin
         view_into(z, frames, f, X)
         for i in range(n):
@@ -180,7 +182,7 @@ def moved_frames(
         same = abs(weight[f] - weight_then[f]) <= tolerance * weight_then[f]
         if frames.start[f] >= 0:
             same = same and abs(X[frames.start[f], 2] - heading_then[f]) <= tolerance
-            for i in range(frames.first_row[f], frames.first_row[f + 1]):
+            for i in range(frames.first_row[f], frames.end_row[f]):
                 scale = 1.0 if i - frames.first_row[f] == 2 else frames.scale[f]
                 same = same and abs(z[i] - z_then[i]) <= tolerance * scale
         if not same:
@@ -198,7 +200,7 @@ def remember_into(
     for f in chosen:
         heading_then[f] = X[frames.start[f], 2] if frames.start[f] >= 0 else 0.0
         weight_then[f] = weight[f]
-        for i in range(frames.first_row[f], frames.first_row[f + 1]):
+        for i in range(frames.first_row[f], frames.end_row[f]):
             z_then[i] = z[i]
 
 
@@ -213,7 +215,7 @@ def place_into(X: Floats, known: Ints, frames: Frames, chosen: Ints) -> None:
                 X[start, a] = frames.given[f, a]
         tx, ty, angle = _pose_of(frames, f, X)
         c, s = math.cos(angle), math.sin(angle)
-        for v in range(frames.first_variable[f], frames.first_variable[f + 1]):
+        for v in range(frames.first_variable[f], frames.end_variable[f]):
             i, m_x, m_y = frames.variable[v], frames.mean[row], frames.mean[row + 1]
             if known[i] == 0:
                 X[i, 0], X[i, 1], known[i] = tx + c * m_x - s * m_y, ty + s * m_x + c * m_y, 1
@@ -304,6 +306,30 @@ def add_pieces_into(F: Floats, frames: Frames, pieces: Ints, at: Evaluation, pla
                 _put_turned(F, t, place[v], T, B, True, cols, rows, d_w, d_v)
         if start >= 0:
             _put_block(F, place[start], place[start], T, 3, 3, True)
+
+
+def held_step(frames: Frames, pieces: Ints, at: Evaluation, variables: Ints, size: Ints) -> Floats:
+    """The Gauss-Newton step of these joint variables, all others held: H_vv d = g_v. Shape (k, 3), 0 where no row is.
+
+    Args:
+        pieces (p, 3): all that touch one of the variables. at: with the gradient of their frames. variables (k,).
+        size: rows of each joint variable.
+
+    Raises NumericalError where H_vv is not positive definite.
+    """
+    sizes = size[variables]
+    n = int(sizes.sum())
+    place = np.full(len(size), n)  # what is held goes to three rows at the end, which nobody reads
+    place[variables] = np.cumsum(sizes) - sizes
+    F = np.zeros((n + 3, n + 3))
+    add_pieces_into(F, frames, pieces, at, place)
+    step = np.zeros((len(variables), 3))
+    there = np.arange(3) < sizes[:, None]
+    try:
+        step[there] = scipy.linalg.cho_solve(scipy.linalg.cho_factor(F[:n, :n]), at.g[variables][there])
+    except scipy.linalg.LinAlgError:
+        raise NumericalError("what a frame is about is not positive definite") from None
+    return step
 
 
 @kernel

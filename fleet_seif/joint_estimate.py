@@ -12,6 +12,8 @@
 4. Whole turns of headings are chosen where `settle` begins and stay: were they chosen at each step, the cost would
    jump where a frame is half a turn off, and no step would bring it down.
 5. Frames that are taken in are placed from where their first pose is and what they saw; what is known stays.
+6. `settle_near` improves only what single frames are about, all else held. What it leaves to be done elsewhere stays in
+   the gradient, for the next `settle`.
 """
 
 from collections.abc import Sequence
@@ -20,7 +22,15 @@ from typing import Final
 import numpy as np
 
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint_assembly import Evaluation, evaluate_into, moved_frames, place_into, remember_into, turns_into
+from fleet_seif.joint_assembly import (
+    Evaluation,
+    evaluate_into,
+    held_step,
+    moved_frames,
+    place_into,
+    remember_into,
+    turns_into,
+)
 from fleet_seif.joint_frames import Frames, Placed
 from fleet_seif.joint_registry import Change, Registry
 from fleet_seif.joint_tree import Piece, Tree
@@ -44,6 +54,9 @@ SLACK: Final = 1e-9
 DAMPING_FIRST: Final = 1e-4
 DAMPING_FACTOR: Final = 10.0
 DAMPING_MAX: Final = 1e9
+NEAR_ITERATIONS: Final = 4
+NEAR_ENOUGH: Final = 1e-4
+"""A frame has settled where a step is shorter than this, in sigmas squared, all else held."""
 
 
 class Estimate:
@@ -59,7 +72,9 @@ class Estimate:
         self._heading = np.zeros(0)
         self._z = np.zeros(0)
         self._weight = np.zeros(0)
-        self._rows = np.zeros(1, np.int64)
+        self._spans = np.empty((0, 2), np.int64)
+        self._generation = 0
+        self._last: Evaluation | None = None
 
     @property
     def frames(self) -> Frames:
@@ -77,18 +92,24 @@ class Estimate:
             self.X = np.concatenate([self.X, np.zeros((more, 3))])
             self._known = np.concatenate([self._known, np.zeros(more, np.int64)])
             self.tree.know(self.registry.sizes[-more:])
-        if self._rows is self.frames.first_row:
-            return
-        z, old, new = np.full(len(self.frames.mean), np.nan), self._rows, self.frames.first_row
-        keep = np.zeros(len(new) - 1, bool)
-        keep[list(self._pieces)] = True
-        for f in np.flatnonzero(keep).tolist():
-            if old[f + 1] - old[f] == new[f + 1] - new[f]:
-                z[new[f] : new[f + 1]] = self._z[old[f] : old[f + 1]]
-        more = len(new) - 1 - len(self._heading)
+        more = len(self.frames.start) - len(self._heading)
         self._heading = np.concatenate([self._heading, np.full(more, np.nan)])
         self._weight = np.concatenate([self._weight, np.full(more, np.nan)])
-        self._z, self._rows = z, new
+        self._make_room_for_views()
+
+    def _make_room_for_views(self) -> None:
+        """Rows of frames stay where they are until the table of frames gives them other places."""
+        rows, moved = len(self.frames.mean), self.registry.table.generation != self._generation
+        if moved or rows > len(self._z):
+            old, self._z = self._z, np.full(2 * rows, np.nan)
+            if not moved:
+                self._z[: len(old)] = old
+            for f in self._pieces if moved else ():
+                first, end = self._spans[f]
+                if end - first == self.frames.end_row[f] - self.frames.first_row[f]:
+                    self._z[self.frames.first_row[f] : self.frames.end_row[f]] = old[first:end]
+        self._spans = np.column_stack([self.frames.first_row, self.frames.end_row])
+        self._generation = self.registry.table.generation
 
     def follow(self, change: Change) -> None:
         """Drop what is gone, take in what is new and what differs."""
@@ -172,6 +193,7 @@ class Estimate:
             if then.cost <= now.cost * (1.0 + SLACK) + SLACK or short:
                 self.X, now = then.X, then
                 if short:
+                    self._last = now
                     return True, now
                 self.damping = self.damping / DAMPING_FACTOR if self.damping > DAMPING_FIRST else 0.0
                 if length > SLOW * last:
@@ -184,6 +206,64 @@ class Estimate:
                 if self.damping > DAMPING_MAX:
                     break
         return False, now
+
+    def settle_near(self, changed: Sequence[int], disagreement: float) -> Evaluation | None:
+        """Improve what each of these frames is about, one after the other, all else held.
+
+        Returns the evaluation of the frames nearby, others as they were; None where that is not enough: a frame's
+        chi-square stays above `disagreement` times where robust weights begin, so what is elsewhere has to give way.
+        """
+        now = self._remembered()
+        if now is None:
+            return None
+        for f in changed:
+            held = self._settle_one(f, now)
+            if held.chi_square[f] > disagreement * self.frames.limit[f]:
+                return None
+            now = held
+        self._last = now
+        return now
+
+    def _remembered(self) -> Evaluation | None:
+        """The last evaluation, with room for the frames and variables that have come since; None before the first."""
+        last = self._last
+        if last is None:
+            return None
+        chi_square, weight = np.zeros(len(self.frames.start)), np.ones(len(self.frames.start))
+        chi_square[: len(last.chi_square)], weight[: len(last.weight)] = last.chi_square, last.weight
+        return last._replace(chi_square=chi_square, weight=weight)
+
+    def _settle_one(self, f: int, now: Evaluation) -> Evaluation:
+        pieces, chosen = self._touching(f)
+        turns = self._turns(chosen)
+        variables = np.unique(np.concatenate([self.tree.pieces[n].variables for n in self._pieces[f]]))
+        then = self._evaluate_near(now, self.X, chosen, turns)
+        for _ in range(NEAR_ITERATIONS):
+            now = then
+            step = held_step(self.frames, pieces, now, variables, self.tree.size)
+            length = float(np.vdot(now.g[variables], step))
+            X = self.X.copy()
+            X[variables] += step
+            then = self._evaluate_near(now, X, chosen, turns)
+            if not then.cost <= now.cost * (1.0 + SLACK) + SLACK:
+                return now
+            self.X = X
+            if length <= NEAR_ENOUGH:
+                return then
+        return then
+
+    def _touching(self, f: int) -> tuple[Ints, Ints]:
+        """Pieces (p, 3) of all frames that touch what frame f is about, and the numbers of those frames, ascending."""
+        pieces = self.tree.touching(self._pieces[f])
+        return pieces, np.unique(pieces[:, 0])
+
+    def _evaluate_near(self, last: Evaluation, X: Floats, chosen: Ints, turns: Floats) -> Evaluation:
+        """Cost, gradient and view of the chosen frames at X; chi-square and weight of the others as they were."""
+        g, z, chi_square, weight = (
+            np.zeros_like(X), np.empty(len(self.frames.mean)), last.chi_square.copy(), last.weight.copy()
+        )  # fmt: skip
+        cost = evaluate_into(g, z, chi_square, weight, self.frames, chosen, X, turns)
+        return Evaluation(X, cost, g, z, chi_square, weight)
 
     def _step(self, now: Evaluation, active: Ints, tolerance: float) -> Floats:
         moved = moved_frames(

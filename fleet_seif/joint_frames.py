@@ -8,7 +8,7 @@ of a pose, (x m, y m, unused) of a landmark.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse
@@ -21,10 +21,13 @@ from fleet_seif.jit import kernel
 from fleet_seif.records import Floats, Ints
 from fleet_seif.robust import huber_limit
 
+A = TypeVar("A", Ints, Floats)
 DENSE_ROWS_MAX: Final = 200
 """Rows of a frame up to which its own mean is found with a dense factor."""
 PIECE_VARIABLES_MAX: Final = 64
 """Variables of a frame up to which it stays in one piece."""
+COMPACT_LEAST: Final = 100_000
+"""Values that may always be left behind before places are given anew."""
 
 
 class SparseFactor:
@@ -67,9 +70,9 @@ class FrameRecord:
 
 
 class Frames(NamedTuple):
-    """Frames one after the other. Those of frame f begin at `first_*[f]` and end before `first_*[f + 1]`.
+    """Frames in common arrays. Those of frame f begin at `first_*[f]` and end before `end_*[f]`.
 
-    first_block, first_variable, first_row (f + 1,).
+    first_*, end_* (f,): of its blocks, variables and rows.
     rows, cols, starts, values: the blocks; `starts` counts from the first value of all frames.
     mean: own means m_f. variable: the joint variable of each of a frame's variables.
     start (f,): the joint variable of T_f, -1 where it is given. given (f, 3): the given T_f, or the prior's mean.
@@ -79,8 +82,11 @@ class Frames(NamedTuple):
     """
 
     first_block: Ints
+    end_block: Ints
     first_variable: Ints
+    end_variable: Ints
     first_row: Ints
+    end_row: Ints
     rows: Ints
     cols: Ints
     starts: Ints
@@ -202,31 +208,87 @@ class Placed:
     prior: Floats
 
 
-def together(placed: Sequence[Placed], *, robust: bool) -> Frames:
-    """Frames one after the other. robust: whether those that disagree are weighted down."""
+class _Heap(Generic[A]):
+    """An array that grows at its end; what has been taken from it stays as it is."""
 
-    def firsts(sizes: list[int]) -> Ints:
-        return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    def __init__(self, array: A) -> None:
+        self._array: A = array
+        self.size = len(array)
 
-    def joined(parts: list[Ints]) -> Ints:
-        return np.concatenate([*parts, np.empty(0, np.int64)])
+    def add(self, part: A) -> tuple[int, int]:
+        """Where it begins and ends."""
+        first, end = self.size, self.size + len(part)
+        if end > len(self._array):
+            larger = np.empty(max(2 * len(self._array), end), self._array.dtype)
+            larger[:first] = self._array[:first]
+            self._array = larger
+        self._array[first:end] = part
+        self.size = end
+        return first, end
 
-    records = [each.record for each in placed]
-    values = firsts([len(record.values) for record in records])
-    means = [record.mean for record in records]
-    return Frames(
-        first_block=firsts([len(record.rows) for record in records]),
-        first_variable=firsts([len(each.variable) for each in placed]),
-        first_row=firsts([len(mean) for mean in means]),
-        rows=joined([record.rows for record in records]),
-        cols=joined([record.cols for record in records]),
-        starts=joined([record.starts[:-1] + at for record, at in zip(records, values, strict=False)]),
-        values=np.concatenate([*(record.values for record in records), np.empty(0)]),
-        mean=np.concatenate([*means, np.empty(0)]),
-        variable=joined([each.variable for each in placed]),
-        start=np.array([each.start for each in placed], np.int64),
-        given=np.array([each.given for each in placed]).reshape(-1, 3),
-        prior=np.array([each.prior for each in placed]).reshape(-1, 3, 3),
-        limit=np.array([record.limit for record in records]) if robust else np.full(len(records), math.inf),
-        scale=np.array([record.scale for record in records]),
-    )
+    def all(self) -> A:
+        whole: A = self._array[: self.size]
+        return whole
+
+
+_LINE: Final = np.dtype(
+    [(f"{end}_{what}", np.int64) for what in ("block", "variable", "row") for end in ("first", "end")]
+    + [("start", np.int64), ("given", np.float64, 3), ("prior", np.float64, (3, 3))]
+    + [("limit", np.float64), ("scale", np.float64)]
+)
+"""What Frames says of one frame."""
+
+
+class FrameTable:
+    """Frames by number, in arrays that only grow: a frame that is put again leaves its old place behind.
+
+    generation: grows when places are given anew, once most of them have been left behind.
+    """
+
+    def __init__(self) -> None:
+        self.placed: list[Placed] = []
+        self.generation = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self._rows, self._cols, self._starts, self._variable = (_Heap(np.empty(0, np.int64)) for _ in range(4))
+        self._values, self._mean = (_Heap(np.empty(0)) for _ in range(2))
+        self._lines = np.empty(0, _LINE)
+        self._live = 0
+
+    def put(self, numbers: Sequence[int], placed: Sequence[Placed]) -> None:
+        """Give these numbers to these frames; numbers that are new follow each other."""
+        for number, each in zip(numbers, placed, strict=True):
+            if number == len(self.placed):
+                self.placed.append(each)
+            else:
+                self._live -= len(self.placed[number].record.values)
+                self.placed[number] = each
+            self._live += len(each.record.values)
+        if 2 * self._live + COMPACT_LEAST < self._values.size:
+            self._clear()
+            self.generation += 1
+            self._live = sum(len(each.record.values) for each in self.placed)
+            numbers, placed = range(len(self.placed)), self.placed
+        more = len(self.placed) - len(self._lines)
+        self._lines = np.concatenate([self._lines, np.zeros(more, _LINE)])  # those taken before stay as they are
+        for number, each in zip(numbers, placed, strict=True):
+            self._lines[number] = self._append(each)
+
+    def _append(self, each: Placed) -> tuple[object, ...]:
+        record = each.record
+        at, _ = self._values.add(record.values)
+        self._cols.add(record.cols)
+        self._starts.add(record.starts[:-1] + at)
+        spans = *self._rows.add(record.rows), *self._variable.add(each.variable), *self._mean.add(record.mean)
+        return (*spans, each.start, each.given, each.prior, record.limit, record.scale)
+
+    def frames(self, *, robust: bool) -> Frames:
+        """All of them as they are now. robust: whether those that disagree are weighted down."""
+        lines = {name: np.ascontiguousarray(self._lines[name]) for name in _LINE.names or ()}
+        if not robust:
+            lines["limit"][:] = math.inf
+        return Frames(
+            **lines, rows=self._rows.all(), cols=self._cols.all(), starts=self._starts.all(),
+            values=self._values.all(), mean=self._mean.all(), variable=self._variable.all(),
+        )  # fmt: skip

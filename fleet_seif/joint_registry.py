@@ -14,7 +14,7 @@ import numpy as np
 
 from fleet_seif.errors import NumericalError
 from fleet_seif.information import POSE, FrameDelta
-from fleet_seif.joint_frames import NO_FRAME, FrameRecord, Frames, Placed, prepared, together
+from fleet_seif.joint_frames import NO_FRAME, FrameRecord, Frames, FrameTable, Placed, prepared
 from fleet_seif.joint_records import Classes, Life
 from fleet_seif.messages import LandmarkName
 from fleet_seif.records import Floats, Ints
@@ -75,14 +75,16 @@ class _Start:
 
 
 class Registry:
-    """See the rules above. sizes: rows of each variable. keys: of each frame number, None where it is free."""
+    """See the rules above. sizes: rows of each variable. keys: of each frame number, None where it is free.
+    class_variables: the variable of each class that was registered last."""
 
     def __init__(self, records: Records) -> None:
         self.records = records
-        self.frames: Frames = together([], robust=True)
+        self.table = FrameTable()
+        self.frames: Frames = self.table.frames(robust=True)
         self.keys: list[FrameKey | None] = []
-        self.placed: list[Placed] = []
         self.sizes: list[int] = []
+        self.class_variables = np.empty(0, np.int64)
         self.robust = True
         self._index: dict[FrameKey, int] = {}
         self._landmarks: dict[LandmarkName, int] = {}
@@ -118,6 +120,11 @@ class Registry:
         robust = any(len(life.frames) > 1 or starts[life.vehicle, life.life].variable >= 0 for life in lives)
         return self._commit(fresh, removed, robust)
 
+    @property
+    def placed(self) -> list[Placed]:
+        """Frames by number, NOWHERE where it is free."""
+        return self.table.placed
+
     def _of(self, number: int) -> Ints:
         return self.placed[number].variable
 
@@ -126,10 +133,10 @@ class Registry:
             key = self.keys[number]
             assert key is not None
             del self._index[key]
-            self.keys[number], self.placed[number] = None, NOWHERE
+            self.keys[number] = None
         free = [number for number, key in enumerate(self.keys) if key is None][::-1] if fresh else []
-        added, altered = [], []
-        for key, placed in sorted(fresh.items(), key=lambda item: (item[0][2], item[0])):
+        added, altered, ordered = [], [], sorted(fresh.items(), key=lambda item: (item[0][2], item[0]))
+        for key, _ in ordered:
             number = self._index.get(key, -1)
             if number >= 0:
                 altered.append(number)
@@ -137,12 +144,13 @@ class Registry:
                 number = free.pop() if free else len(self.keys)
                 if number == len(self.keys):
                     self.keys.append(None)
-                    self.placed.append(NOWHERE)
                 added.append(number)
                 self._index[key] = number
-            self.keys[number], self.placed[number] = key, placed
+            self.keys[number] = key
         if fresh or removed or robust != self.robust:
-            self.frames, self.robust = together(self.placed, robust=robust), robust
+            self.table.put(removed, [NOWHERE] * len(removed))
+            self.table.put([self._index[key] for key, _ in ordered], [placed for _, placed in ordered])
+            self.frames, self.robust = self.table.frames(robust=robust), robust
         return Change(added, altered, removed)
 
     def _placed(self, key: FrameKey, delta: FrameDelta, record: FrameRecord, table: Ints, start: _Start) -> Placed:
@@ -164,13 +172,10 @@ class Registry:
         """The variable of the pose where a frame of a life starts."""
         return self._variable(self._poses, (vehicle, life, f), 3)
 
-    def landmark(self, names: tuple[LandmarkName, ...]) -> int:
-        """The variable of a class."""
-        return self._variable(self._landmarks, names[0], 2)
-
     def _variable(self, numbers: dict[K, int], key: K, size: int) -> int:
-        number = numbers.setdefault(key, len(self.sizes))
-        if number == len(self.sizes):
+        number = numbers.get(key)
+        if number is None:
+            number = numbers[key] = len(self.sizes)
             self.sizes.append(size)
         return number
 
@@ -182,8 +187,9 @@ class Registry:
     def _tables_of(self, lives: Sequence[Life], classes: Classes) -> dict[tuple[str, int], Ints]:
         """For each life the variable of each landmark by number, -1 where it is in no class."""
         tables = {(life.vehicle, life.life): [-1] * len(life.signatures) for life in lives}
-        for names in classes:
-            variable = self.landmark(names)
+        variables = [self._variable(self._landmarks, names[0], 2) for names in classes]
+        self.class_variables = np.array(variables, np.int64)
+        for names, variable in zip(classes, variables, strict=True):
             for vehicle, life, number in names:
                 tables[vehicle, life][number] = variable
         return {name: np.array(table, np.int64) for name, table in tables.items()}

@@ -6,7 +6,9 @@
 2. `replay` is a function of the lives and classes alone, in the order given. One thread, no clock.
 3. `update` goes on from the last solution: frames that are the same objects about the same landmarks keep what is known
    of them, others are placed by them. Where that fails it replays.
-4. Where every vehicle has one frame and a given start pose the system is linear: one round, no robust weights.
+4. In large maps `update` improves only what has changed, all else held, until a share of the frames has come or been
+   corrected since all were solved, or a frame does not fit what is held (MATHS.md 13 has what that costs).
+5. Where every vehicle has one frame and a given start pose the system is linear: one round, no robust weights.
 """
 
 from collections.abc import Sequence
@@ -19,7 +21,7 @@ from fleet_seif.jit import one_thread
 from fleet_seif.joint_assembly import Evaluation
 from fleet_seif.joint_estimate import Estimate
 from fleet_seif.joint_records import Classes, JointSolution, Life, System
-from fleet_seif.joint_registry import Records, Registry
+from fleet_seif.joint_registry import Change, Records, Registry
 from fleet_seif.messages import LandmarkName
 from fleet_seif.records import Ints
 
@@ -28,6 +30,12 @@ ITERATIONS_MAX: Final = 400
 WARM_ITERATIONS_MAX: Final = 100
 WARM_ENOUGH: Final = 1e-6
 """An update is over when a step is shorter than this, in sigmas squared over all variables."""
+NEAR_FRAMES_LEAST: Final = 256
+"""Maps of fewer frames are solved as a whole."""
+PENDING_SHARE: Final = 1.0 / 48.0
+"""All is solved when more than this share of the frames has come or been corrected since, each life's newest apart."""
+DISAGREEMENT: Final = 2.0
+"""All is solved when a frame's chi-square stays above this many times where its robust weight begins, all else held."""
 ROUND_ITERATIONS: Final = 8
 ROUND_ENOUGH: Final = 1e-2
 """A round is over when a step is shorter than this, in sigmas squared over all variables."""
@@ -40,6 +48,7 @@ class JointSolver:
     def __init__(self) -> None:
         self._records = Records()
         self._estimate: Estimate | None = None
+        self._changed: set[int] = set()
 
     @one_thread
     def replay(self, lives: Sequence[Life], classes: Classes) -> JointSolution:
@@ -78,13 +87,29 @@ class JointSolver:
                 change = estimate.registry.register(lives, classes)
                 if 2 * len(change.added) <= len(estimate.active):
                     estimate.follow(change)
-                    settled, at = estimate.settle(WARM_ITERATIONS_MAX, WARM_ENOUGH)
-                    if settled:
+                    at = self._settled_near(estimate, change, lives) or self._settled(estimate)
+                    if at is not None:
                         self._estimate = estimate
                         return _solution(estimate, at, lives, classes)
             except NumericalError:  # replayed below, which raises it again if it is not for the start
                 pass
         return self.replay(lives, classes)
+
+    def _settled(self, estimate: Estimate) -> Evaluation | None:
+        """All of it."""
+        self._changed.clear()
+        settled, at = estimate.settle(WARM_ITERATIONS_MAX, WARM_ENOUGH)
+        return at if settled else None
+
+    def _settled_near(self, estimate: Estimate, change: Change, lives: Sequence[Life]) -> Evaluation | None:
+        """Rule 4; None where all has to be solved."""
+        changed, keys = sorted([*change.added, *change.altered]), estimate.registry.keys
+        newest = {(life.vehicle, life.life, len(life.frames) - 1) for life in lives}
+        self._changed.update(changed)
+        pending, count = sum(keys[f] not in newest for f in self._changed), len(estimate.active)
+        if change.removed or count < NEAR_FRAMES_LEAST or pending > PENDING_SHARE * count:
+            return None
+        return estimate.settle_near(changed, DISAGREEMENT)
 
 
 def _round_ends(last: int, *, single: bool) -> list[int]:
@@ -98,25 +123,24 @@ def _round_ends(last: int, *, single: bool) -> list[int]:
     return ends
 
 
-def _rows(registry: Registry, lives: Sequence[Life], classes: Classes) -> tuple[Ints, list[tuple[str, int, int]]]:
+def _rows(registry: Registry, lives: Sequence[Life]) -> tuple[Ints, list[tuple[str, int, int]]]:
     """The joint variable of each landmark and pose in the order of a solution's rows, and the poses."""
-    variables, poses = [registry.landmark(names) for names in classes], []
+    variables, poses = [], []
     for life in lives:
         count = len(life.frames)
         for k in range(count + 1):
             if k > 0 or np.any(life.start_pose_cov):
                 variables.append(registry.pose(life.vehicle, life.life, k))
                 poses.append((life.vehicle, life.life, k if k < count else -1))
-    return np.array(variables, np.int64), poses
+    return np.concatenate([registry.class_variables, np.array(variables, np.int64)]), poses
 
 
 def _solution(estimate: Estimate, at: Evaluation, lives: Sequence[Life], classes: Classes) -> JointSolution:
     registry = estimate.registry
-    variables, poses = _rows(registry, lives, classes)
-    touched = np.concatenate([registry.frames.variable, registry.frames.start])
-    idle = np.setdiff1d(variables, touched)
-    if len(idle):
-        raise NumericalError(f"{len(idle)} landmarks or poses are in no frame: the joint map has no solution")
+    variables, poses = _rows(registry, lives)
+    idle = np.count_nonzero(estimate.tree.touches[variables] == 0)
+    if idle:
+        raise NumericalError(f"{idle} landmarks or poses are in no frame: the joint map has no solution")
     signatures = {(life.vehicle, life.life): life.signatures for life in lives}
 
     def signature(name: LandmarkName) -> int:
@@ -134,7 +158,7 @@ def _solution(estimate: Estimate, at: Evaluation, lives: Sequence[Life], classes
         frames=keys,
         weight=at.weight[chosen],
         chi_square=at.chi_square[chosen],
-        dof=np.diff(registry.frames.first_row)[chosen],
+        dof=(registry.frames.end_row - registry.frames.first_row)[chosen],
         system=System(
             frames=registry.frames,
             pieces=tuple(estimate.tree.pieces.values()),

@@ -217,7 +217,8 @@ def _factored(D: Floats, W: Floats, U: Floats, damping: float) -> None:
 class Tree:
     """See the rules above.
 
-    Joint variables are numbered 0 ... v-1 in the order they were told of; the state has three rows for each.
+    Joint variables are numbered 0 ... v-1 in the order they were told of; the state has three rows for each. size (v,):
+    rows of each in the system; touches (v,): how many pieces it is in.
     """
 
     def __init__(self) -> None:
@@ -228,7 +229,7 @@ class Tree:
         self._leaf: dict[int, Node] = {}
         self._home: list[Node | None] = []
         self._touching: list[set[int]] = []
-        self._total = np.empty(0, np.int64)
+        self.touches = np.empty(0, np.int64)
         self._place = np.empty(0, np.int64)
         self._order: list[Node] = []
         self._damping = 0.0
@@ -237,7 +238,7 @@ class Tree:
         """More joint variables: two rows each, or three."""
         more = np.array(sizes, np.int64)
         self.size = np.concatenate([self.size, more])
-        self._total = np.concatenate([self._total, np.zeros(len(more), np.int64)])
+        self.touches = np.concatenate([self.touches, np.zeros(len(more), np.int64)])
         self._place = np.zeros(len(self.size), np.int64)
         self._home += [None] * len(more)
         self._touching += [set() for _ in more]
@@ -277,12 +278,18 @@ class Tree:
         self._untouch(number, np.setdiff1d(old, piece.variables))
         self._touch(number, np.setdiff1d(piece.variables, old))
 
+    def touching(self, numbers: Sequence[int]) -> Ints:
+        """Frame, first and last block + 1 of every piece that shares a variable with these, itself included; (p, 3)."""
+        variables = {v for number in numbers for v in self.pieces[number].variables.tolist()}
+        found = sorted(set[int]().union(*(self._touching[v] for v in variables)))
+        return np.array([self.pieces[number][:3] for number in found], np.int64)
+
     def _touch(self, number: int, variables: Ints) -> None:
         """A piece touches these: where they were eliminated they may no longer be."""
         for v in variables.tolist():
             self._mark(self._home[v])
             self._touching[v].add(number)
-        self._total[variables] += 1
+        self.touches[variables] += 1
 
     def _untouch(self, number: int, variables: Ints) -> None:
         """A piece no longer touches these: they may be eliminated nearer to those that do."""
@@ -290,7 +297,7 @@ class Tree:
             self._touching[v].discard(number)
             for other in self._touching[v]:
                 self._mark(self._leaf[other])
-        self._total[variables] -= 1
+        self.touches[variables] -= 1
 
     def relinearise(self, numbers: Sequence[int]) -> None:
         """These pieces are to be added up anew, their variables as before."""
@@ -380,7 +387,7 @@ class Tree:
             variables, counts = np.unique(np.concatenate([*touched, nothing]), return_counts=True)
             lists = [(variables, counts.astype(np.int64)), (nothing, nothing)]
         (a, a_counts), (b, b_counts) = lists
-        node.variables, node.counts, node.eliminated = _merged(a, a_counts, b, b_counts, self._total)
+        node.variables, node.counts, node.eliminated = _merged(a, a_counts, b, b_counts, self.touches)
         node.rows = _rows_into(self._place, node.variables, self.size)
         for child in node.children:
             child.place = _positions(self._place, child.variables[child.eliminated :], self.size)

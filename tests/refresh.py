@@ -8,7 +8,7 @@ import argparse
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
@@ -19,7 +19,7 @@ from fleet_seif import joint
 from fleet_seif.frame_deltas import quantised
 from fleet_seif.information import FrameDelta
 from fleet_seif.jit import one_thread
-from fleet_seif.joint import JointSolver, Life
+from fleet_seif.joint import JointSolution, JointSolver, Life
 from fleet_seif.records import Floats
 from tests import reference
 
@@ -36,6 +36,8 @@ SPACING_M = 0.15
 """Between steps: a frame sees 11 landmarks."""
 WIDE_M = 0.36
 """The same where 3 vehicles see 2,000 landmarks in 1,000 steps each: a frame sees 20."""
+FLAT_FRAMES = 14
+"""So many new frames of each vehicle are timed: more than twice as many as the largest map lets wait."""
 
 
 @dataclass
@@ -169,41 +171,65 @@ def altered(life: Life) -> Life:
     return dataclasses.replace(life, frames=(*life.frames[:-1], dataclasses.replace(last, b=last.b + last.b // 1000)))
 
 
-@one_thread
-def refreshes(drives: Sequence[Drive], first: int, last: int, *, covariances: bool = False) -> float:
-    """Mean milliseconds of a refresh after each new frame, once the cold solution is there."""
+def refreshing(drives: Sequence[Drive], first: int, last: int) -> Iterator[tuple[float, float, JointSolution]]:
+    """After the cold solution (its seconds twice), for each new frame: milliseconds of a refresh with it, and of one in
+    which an open frame has gone on; what was found."""
     lives = arrivals(drives, first, last)
     classes = [joint.landmark_classes(each) for each in lives]
-    solver, spent, open_frame = JointSolver(), [], []
+    solver = JointSolver()
     solution, cold = timed(partial(solver.replay, lives[0], classes[0]))
+    yield cold, cold, solution
     for each, names in zip(lives[1:], classes[1:], strict=True):
-        solution, seconds = timed(partial(solver.update, each, names))
-        spent.append(1e3 * seconds)
-        _, seconds = timed(partial(solver.update, [altered(each[0]), *each[1:]], names))
-        open_frame.append(1e3 * seconds)
+        solution, new_frame = timed(partial(solver.update, each, names))
+        _, open_frame = timed(partial(solver.update, [altered(each[0]), *each[1:]], names))
+        yield 1e3 * new_frame, 1e3 * open_frame, solution
+
+
+def tell(found: Sequence[tuple[float, float, JointSolution]]) -> float:
+    """Print what `refreshing` has found; the mean of new frames."""
+    (cold, _, _), *rest = found
+    new, altered = [row[0] for row in rest], [row[1] for row in rest]
+    solution = found[-1][2]
     report(
-        f"{len(classes[-1]):6d} landmarks, {len(solution.frames):5d} frames: replay {cold:6.2f} s; new frame: median "
-        f"{statistics.median(spent):6.1f} ms, mean {statistics.mean(spent):6.1f} ms, worst {max(spent):6.1f} ms; "
-        f"open frame altered: median {statistics.median(open_frame):6.1f} ms"
+        f"{len(solution.classes):6d} landmarks, {len(solution.frames):5d} frames: replay {cold:6.2f} s; new frame: "
+        f"median {statistics.median(new):6.1f} ms, mean {statistics.mean(new):6.1f} ms, worst {max(new):6.1f} ms; "
+        f"open frame altered: median {statistics.median(altered):6.1f} ms"
     )
-    if covariances:
-        report(f"{'':30s} covariances of all {timed(partial(joint.marginal_covariances, solution))[1]:6.2f} s")
-    return statistics.mean(spent)
+    return statistics.mean(new)
+
+
+@one_thread
+def refreshes(drives: Sequence[Drive], first: int, last: int) -> None:
+    """Times of new frames, and of all covariances."""
+    found = list(refreshing(drives, first, last))
+    tell(found)
+    report(f"{'':30s} covariances of all {timed(partial(joint.marginal_covariances, found[-1][2]))[1]:6.2f} s")
+
+
+@one_thread
+def flat(drives: Sequence[Drive], counts: Sequence[int]) -> None:
+    """Times at several lengths of a run, one refresh of each after the other, so that all have the same machine."""
+    runs = list(zip(*(refreshing(drives, count - FLAT_FRAMES, count) for count in counts), strict=True))
+    means = [tell(found) for found in zip(*runs, strict=True)]
+    report(f"mean refresh at the end / at the tenth: {means[-1] / means[0]:.2f}")
+    lives, last = [drive.life() for drive in drives], runs[-1][-1][2]
+    whole = joint.solve(lives, joint.landmark_classes(lives))
+    variance = np.diagonal(joint.marginal_covariances(whole)[0], axis1=1, axis2=2)
+    off = np.abs(last.landmark_mean - whole.landmark_mean) / np.sqrt(variance)
+    report(f"last map against the canonical one: {np.sqrt(np.mean(off**2)):.3f} sigma rms, {off.max():.3f} at most")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=["1000", "10000", "flat"], default=["1000", "10000", "flat"])
     chosen = parser.parse_args().only
-    refreshes(fleet(100, 2, 6, SPACING_M), 4, 6, covariances=True)  # compiles
+    refreshes(fleet(100, 2, 6, SPACING_M), 4, 6)  # compiles
     if "1000" in chosen:
-        refreshes(fleet(1000, 3, 100, SPACING_M), 85, 100, covariances=True)
+        refreshes(fleet(1000, 3, 100, SPACING_M), 85, 100)
     if "10000" in chosen:
-        refreshes(fleet(10_000, 5, 600, SPACING_M), 596, 600, covariances=True)
+        refreshes(fleet(10_000, 5, 600, SPACING_M), 596, 600)
     if "flat" in chosen:
-        drives = fleet(2000, 3, 400, WIDE_M)
-        tenth, _, _, end = (refreshes(drives, last - 10, last) for last in (40, 80, 200, 400))
-        report(f"mean refresh at the end / at the tenth: {end / tenth:.2f}")
+        flat(fleet(2000, 3, 400, WIDE_M), (40, 80, 200, 400))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_seif import joint_solver
 from fleet_seif.errors import NumericalError
 from fleet_seif.frame_deltas import quantised
 from fleet_seif.information import B_QUANTUM, FrameDelta, to_information
@@ -21,7 +22,7 @@ from fleet_seif.joint import (
     marginal_covariances,
     solve,
 )
-from fleet_seif.joint_assembly import assembled
+from fleet_seif.joint_assembly import assembled, evaluate_into, turns_into
 from fleet_seif.joint_estimate import Estimate
 from fleet_seif.joint_records import Classes
 from fleet_seif.joint_registry import Records, Registry
@@ -88,6 +89,72 @@ def test_a_warm_solution_is_the_cold_one_whatever_came_went_or_changed_before(
         else:
             with pytest.raises(NumericalError, match="nothing to solve"):
                 warm.update(lives, classes)
+
+
+def near_solver(monkeypatch: pytest.MonkeyPatch, share: float) -> JointSolver:
+    """A solver for which the map of these drives is large."""
+    monkeypatch.setattr(joint_solver, "NEAR_FRAMES_LEAST", 0)
+    monkeypatch.setattr(joint_solver, "PENDING_SHARE", share)
+    return JointSolver()
+
+
+def lives_of(*frames: int) -> list[Life]:
+    return [drive.life(count) for drive, count in zip(drives(), frames, strict=True)]
+
+
+def test_in_a_large_map_a_new_frame_moves_what_it_is_about_to_the_best_place_and_nothing_else(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    solver = near_solver(monkeypatch, 1.0)
+    before = solver.replay(lives_of(7, 7, 6), landmark_classes(lives_of(7, 7, 6)))
+    lives = lives_of(8, 7, 6)
+    after = solver.update(lives, landmark_classes(lives))
+    known = {name: mean for names, mean in zip(before.classes, before.landmark_mean, strict=True) for name in names}
+    seen = {LandmarkName("v0", 0, n - 1) for n in lives[0].frames[7].variables[1:].tolist()}
+    about = [not seen.isdisjoint(names) for names in after.classes]
+    for names, mean, own in zip(after.classes, after.landmark_mean, about, strict=True):
+        if not own:
+            np.testing.assert_array_equal(mean, known[names[0]])
+    rows = np.concatenate(
+        [np.repeat(about, 2), np.repeat([(v, k) in (("v0", 7), ("v0", -1)) for v, _, k in after.poses], 3)]
+    )
+    step = np.linalg.solve(after.H[rows][:, rows].toarray(), gradient_at(after)[rows])
+    assert np.abs(gradient_at(after)[~rows]).max() > 1.0  # what is elsewhere would like to follow
+    assert step @ after.H[rows][:, rows] @ step < 1e-3
+
+
+def gradient_at(solution: JointSolution) -> Floats:
+    """Minus half the gradient of the whole cost at a solution's mean, by its rows."""
+    system = solution.system
+    X, count = system.at.X, 2 * len(solution.classes)
+    g, numbers = np.zeros_like(X), np.arange(len(system.frames.start))
+    z, chi, weight, turns = np.zeros(len(system.frames.mean)), *np.zeros((2, len(numbers))), np.zeros((len(numbers), 2))
+    turns_into(turns, system.frames, numbers, X)
+    evaluate_into(g, z, chi, weight, system.frames, numbers, X, turns)
+    variable = system.variable
+    return np.concatenate([g[variable[: count // 2], :2].ravel(), g[variable[count // 2 :]].ravel()])
+
+
+def test_in_a_large_map_all_is_solved_once_enough_has_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joint_solver, "DISAGREEMENT", np.inf)
+    solver = near_solver(monkeypatch, 0.5 / 20)  # none but the newest may wait
+    solver.replay(lives_of(6, 7, 6), landmark_classes(lives_of(6, 7, 6)))
+    off = []
+    for counts in ((7, 7, 6), (8, 7, 6), (8, 8, 6)):
+        lives = lives_of(*counts)
+        classes = landmark_classes(lives)
+        off.append(sigmas(solver.update(lives, classes), solve(lives, classes)))
+    assert min(off[0], off[2]) > 1e-2
+    assert off[1] <= 1e-2
+    assert max(off) < 1.0
+
+
+def test_in_a_large_map_all_is_solved_when_a_frame_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A loop closes: what is held is far off."""
+    life, _ = loop(30, 0.1, 0)
+    solver, early = near_solver(monkeypatch, 1.0), dataclasses.replace(life, frames=life.frames[:-2])
+    solver.replay([early], classes_of(life, 2))
+    assert sigmas(solver.update([life], classes_of(life)), solve([life], classes_of(life))) <= 1e-2
 
 
 @given(st.lists(moments(), min_size=1, max_size=4))
