@@ -1,7 +1,7 @@
 """What a world or a data set yields: every reading of every vehicle, and the truth to score it by."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,11 @@ class Log:
     @property
     def steps(self) -> int:
         return len(self.odometry)
+
+    def chosen(self, sightings: Ints) -> "Log":
+        """The log with these of its sightings, by index, in this order, in which steps must ascend."""
+        names = ("sighting_step", "sighting_z", "sighting_cov", "sighting_signature", "sighting_truth")
+        return replace(self, **{name: getattr(self, name)[sightings] for name in names})
 
     def sightings_at(self, step: int) -> Sightings:
         """What was seen from pose `step`."""
