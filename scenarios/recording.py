@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleet_seif.records import Floats, Ints, Reading, Sightings
+from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,3 +71,18 @@ class Recording:
     landmarks: Floats
     logs: dict[str, Log]
     skipped: dict[str, int]
+
+    def identified(self) -> "Recording":
+        """The recording; where none of its sightings has a signature, with true landmarks as signatures.
+
+        For what is given the answer on purpose. What is no landmark has no signature then either.
+        """
+        if any(np.any(log.sighting_signature != UNKNOWN_SIGNATURE) for log in self.logs.values()):
+            return self
+        logs = {
+            name: replace(
+                log, sighting_signature=np.where(log.sighting_truth < 0, UNKNOWN_SIGNATURE, log.sighting_truth)
+            )
+            for name, log in self.logs.items()
+        }
+        return replace(self, logs=logs)
