@@ -1,6 +1,7 @@
 """Scores of association: cases that can be counted by hand, laws, and whole runs."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from fleet_seif.joint import JointSolution, marginal_covariances, solve
 from fleet_seif.records import Floats, Ints
+from scenarios import output
 from scenarios.association import Association, assigned_truth, associate, fleet_association
 from scenarios.recording import Log, Recording
 from scenarios.report import FinishedRun
@@ -144,6 +146,22 @@ def test_known_signatures_are_all_assigned_rightly(run: FinishedRun) -> None:
     for name, log in run.recording.logs.items():
         drive = run.drives[name]
         np.testing.assert_array_equal(drive.signatures[drive.assigned], log.sighting_signature)
+
+
+def test_scores_do_not_look_at_signatures(run: FinishedRun) -> None:
+    logs = {
+        name: replace(log, sighting_signature=np.full_like(log.sighting_signature, -1))
+        for name, log in run.recording.logs.items()
+    }
+    hidden = replace(run, recording=replace(run.recording, logs=logs))
+    assert evaluate_run(hidden).report == evaluate_run(run).report
+
+
+def test_what_a_vehicle_process_hands_over_is_read_back(run: FinishedRun, tmp_path: Path) -> None:
+    drive = run.drives["v2"]
+    output.write_drive(tmp_path / "v2.npz", drive)
+    for field, value in vars(output.read_drive(tmp_path / "v2.npz")).items():
+        np.testing.assert_array_equal(value, getattr(drive, field))
 
 
 @pytest.mark.parametrize("state_bytes", [500, 64 * 1024])
