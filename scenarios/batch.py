@@ -4,7 +4,8 @@ With all poses x (vehicle v, step k) and all landmarks y free, it minimises
 
     sum |x_k - g(x_k-1, u_k)|^2 in U_k  +  sum rho(|z - h(x_k, y)|^2 in Z)  +  priors of start poses
 
-by Levenberg-Marquardt; rho is the square, or Huber's where asked. It knows which landmark is which by signature.
+by Levenberg-Marquardt; rho is the square, or Huber's where asked. It knows which landmark is which by signature, and
+where readings have none at all it is told the truth (`Recording.identified`): then it shows what association costs.
 
 1. Keys: landmarks 0, 1, ... by ascending signature, then poses by vehicle and step. Rows of H are in that order, a
    pose's in its own tangent space. A given start pose is a constant and has no rows.
@@ -70,7 +71,8 @@ class Guess:
 class BatchSolution:
     """The minimum that was found.
 
-    signatures (n,), ascending; landmark_mean (n, 2), m. poses: by vehicle (T+1, 3), headings wrapped.
+    signatures (n,), of `Recording.identified`, ascending; landmark_mean (n, 2), m.
+    poses: by vehicle (T+1, 3), headings wrapped.
     H: information, sparse CSR, rows as in rule 1; with robust weights in it where they were asked for.
     chi_square: twice the objective; degrees_of_freedom: of all residuals together, less the free variables.
     left_out: sightings without a signature.
@@ -109,7 +111,7 @@ def solve_batch(
         RunError: gtsam is not installed, there is nothing to solve, or `start` lacks something.
         NumericalError: no minimum was found.
     """
-    problem = _Problem(_gtsam(), recording, robust, progress)
+    problem = _Problem(_gtsam(), recording.identified(), robust, progress)
     try:
         return problem.minimised(problem.filtered() if start is None else problem.at(start))
     except RuntimeError as error:
@@ -136,7 +138,7 @@ class _Problem:
         seen = [log.sighting_signature for log in self._logs]
         self._signatures: Ints = np.unique(np.concatenate(seen)) if seen else np.empty(0, np.int64)
         if not len(self._signatures):
-            raise RunError("the batch has nothing to solve: no sighting in these readings has a signature")
+            raise RunError("the batch has nothing to solve: no sighting in these readings has a signature or a truth")
         self._left_out = sum(len(log.sighting_signature) for log in recording.logs.values()) - sum(map(len, seen))
         self._kernel = gtsam.noiseModel.mEstimator.Huber.Create(HUBER) if robust else None
 
@@ -328,8 +330,7 @@ def _with_signatures(log: Log) -> Log:
     known = log.sighting_signature != UNKNOWN_SIGNATURE
     if known.all():
         return log
-    names = ("sighting_step", "sighting_z", "sighting_cov", "sighting_signature", "sighting_truth")
-    return Log(**{**vars(log), **{name: getattr(log, name)[known] for name in names}})
+    return log.chosen(np.flatnonzero(known))
 
 
 def _is_given(log: Log) -> bool:

@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 from fleet_seif.config import FilterSettings, FusionSettings, NotNegative, PublishSettings, Settings
 from fleet_seif.link import LinkSettings
 from fleet_seif.messages import NAME_MAX
+from scenarios.detection import DetectionSettings
 from scenarios.faults import FaultSettings
 from scenarios.mrclam import DatasetSettings
 from scenarios.world import NoiseSettings, WorldSettings
@@ -50,6 +51,7 @@ class Scenario(Settings):
     fleet: FleetSettings = FleetSettings()
     world: WorldSettings | None = None
     noise: NoiseSettings = NoiseSettings()
+    detection: DetectionSettings = DetectionSettings()
     dataset: DatasetSettings | None = None
     filter: FilterSettings = FilterSettings()
     publish: PublishSettings = PublishSettings()
@@ -67,6 +69,8 @@ class Scenario(Settings):
                 f'world.routes = "meetings" is for three vehicles, fleet.vehicles is {self.fleet.vehicles}: '
                 'use world.routes = "coverage"'
             )
+        if self.dataset is not None and not self.detection.is_of_recorded_data:
+            raise ValueError("of [detection] a [dataset] takes signatures only: the rest is for a simulated [world]")
         return self
 
 

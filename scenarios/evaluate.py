@@ -19,11 +19,13 @@ from rich.text import Text
 from fleet_seif.joint import marginal_chi_square, solve
 from fleet_seif.records import Floats
 from scenarios import output
+from scenarios.association import associate, fleet_association, majority_truth
 from scenarios.batch import BatchSolution, solve_batch
 from scenarios.recording import Recording
 from scenarios.report import FinishedRun
-from scenarios.score import BAND, align, chi_square_band, landmark_truths, majority, rmse, signature_truth
+from scenarios.score import BAND, align, chi_square_band, landmark_truths, majority, rmse
 from scenarios.stored_run import MapEstimate, StoredRun
+from scenarios.table import association_words
 
 FIT_MAX: Final = 1.5
 """Chi-square per degree of freedom of a batch above which its readings are not what they declare to be."""
@@ -116,15 +118,15 @@ def fused_map(run: FinishedRun) -> MapEstimate:
     """The canonical map of a run."""
     lives = run.ledger.lives()
     solution = solve(lives, run.ledger.classes(lives))
-    truth = landmark_truths(solution, run.recording)
+    truth = landmark_truths(solution, run.truths)
     return MapEstimate(mean=solution.landmark_mean, truth=truth, H=solution.H)
 
 
 def batch_map(solution: BatchSolution, recording: Recording) -> MapEstimate:
     """A batch's map, each landmark with the truth that most vehicles' signatures stand for."""
     truths: dict[int, list[int]] = {}
-    for log in recording.logs.values():
-        for signature, truth in signature_truth(log).items():
+    for log in recording.identified().logs.values():
+        for signature, truth in majority_truth(log.sighting_signature, log.sighting_truth).items():
             truths.setdefault(signature, []).append(truth)
     majorities = np.array([majority(truths[signature]) for signature in solution.signatures.tolist()], np.int64)
     return MapEstimate(mean=solution.landmark_mean, truth=majorities, H=solution.H)
@@ -151,6 +153,7 @@ def score_run(run: StoredRun) -> dict[str, Any]:
     logs = run.recording.logs
     vehicles = {
         name: {
+            **associate(log, run.assigned[name]).fields(),
             "own_map_rmse_m": run.report["vehicles"][name]["landmark_rmse_m"],
             **_fields("live_", pose_errors([run.tracks[name]], [log.truth_pose])),
             **_fields("joint_", pose_errors([run.joint_poses[name]], [log.truth_pose])),
@@ -167,6 +170,7 @@ def score_run(run: StoredRun) -> dict[str, Any]:
         "map": asdict(map_errors(run.map, run.recording.landmarks)),
         "trajectory": asdict(_trajectory(run, run.joint_poses)),
         "vehicles": vehicles,
+        **fleet_association(run.recording, run.assigned).fields(),
         "bytes_per_step_mean": bytes_put / max(steps, 1),
     }
 
@@ -256,6 +260,7 @@ def score_table(scored: Mapping[str, Any]) -> Group:
 def _remarks(scored: Mapping[str, Any]) -> str:
     batch = scored.get("batch")
     lines = [
+        association_words(scored),
         f"{scored['bytes_per_step_mean']:.0f} bytes a step and vehicle; live poses are what a vehicle knew then,",
         "joint poses are the frame starts and newest poses of the fused map"
         + ("" if batch is None else ", the batch's"),

@@ -21,10 +21,11 @@ from matplotlib.markers import MarkerStyle
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Affine2D
 
-from fleet_seif.records import UNKNOWN_SIGNATURE, Floats
+from fleet_seif.records import Floats
+from scenarios.association import Truths
 from scenarios.history import Moment, meetings
 from scenarios.recording import Log, Recording
-from scenarios.score import align, rmse, signature_truth
+from scenarios.score import align, landmark_truths, rmse
 
 Kind = Literal["meetings", "overview"]
 
@@ -66,14 +67,14 @@ class FigureTimes:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What all parts of a figure share. truths: true landmark by vehicle and signature."""
+    """What all parts of a figure share."""
 
     recording: Recording
     moments: Sequence[Moment]
     times: FigureTimes
     tracks: Mapping[str, Floats]
     colours: dict[str, Any]
-    truths: dict[str, dict[int, int]]
+    truths: Truths
 
 
 def figure_times(kind: Kind, recording: Recording) -> FigureTimes:
@@ -119,6 +120,7 @@ def draw_figure(
     times: FigureTimes,
     moments: Sequence[Moment],
     tracks: Mapping[str, Floats],
+    truths: Truths,
 ) -> None:
     """Write the figure as a PNG of SIZE_IN by DPI pixels.
 
@@ -126,10 +128,8 @@ def draw_figure(
         times: as `figure_times` gave them; its kind decides the layout.
         moments: the joint map at those times, as `history.replay` gave them; some or all may be missing.
         tracks: each vehicle's live estimate (T+1, 3), pose k at its log's time k; vehicles may be missing.
+        truths: which true landmark each vehicle's landmarks are.
     """
-    truths = {name: signature_truth(log) for name, log in recording.logs.items()}
-    for of_vehicle in truths.values():
-        of_vehicle.pop(UNKNOWN_SIGNATURE, None)
     scene = _Scene(recording, moments, times, tracks, _colours(list(recording.logs)), truths)
     figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
@@ -328,17 +328,11 @@ def _colours(vehicles: Sequence[str]) -> dict[str, Any]:
 
 
 def _landmark_errors(scene: _Scene, moment: Moment) -> tuple[float, float]:
-    """RMS distance of the landmarks from the true ones of their signature, m, as they are and after alignment.
+    """RMS distance of the landmarks from the true ones that they are, m, as they are and after alignment.
 
     NaN for what cannot be told: without truth, and for an alignment of fewer than three landmarks.
     """
-    truth = np.array(
-        [
-            max(scene.truths.get(name.vehicle, {}).get(signature, -1) for name in names)
-            for names, signature in zip(moment.solution.classes, moment.solution.signatures, strict=True)
-        ],
-        np.int64,
-    )
+    truth = landmark_truths(moment.solution, scene.truths)
     known = truth >= 0
     mean, target = moment.solution.landmark_mean[known], scene.recording.landmarks[truth[known]]
     error = rmse(mean - target)

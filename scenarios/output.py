@@ -38,8 +38,8 @@ def prepare_folder(folder: Path) -> None:
         raise RunError(f"cannot write to {folder}: {error.strerror or error}; give another --out DIR") from None
 
 
-def write_readings(folder: Path, log: Log) -> None:
-    """readings/<vehicle>.npz: exactly what the filter was fed."""
+def write_readings(folder: Path, log: Log, assigned: Ints) -> None:
+    """readings/<vehicle>.npz: exactly what the filter was fed, and beside it what it took each sighting for."""
     np.savez_compressed(
         folder / "readings" / f"{log.vehicle}.npz",
         time_s=log.time_s,
@@ -51,6 +51,7 @@ def write_readings(folder: Path, log: Log) -> None:
         sighting_cov=log.sighting_cov,
         sighting_signature=log.sighting_signature,
         sighting_truth=log.sighting_truth,
+        sighting_assigned=assigned,
         start_pose=log.start_pose,
         start_pose_cov=log.start_pose_cov,
     )
@@ -172,6 +173,7 @@ def read_drive(path: Path) -> DriveResult:
         pose=arrays["pose"],
         landmarks=arrays["landmarks"],
         signatures=arrays["signatures"],
+        assigned=arrays["assigned"],
         filter_s=arrays["filter_s"],
         publish_s=arrays["publish_s"],
         bytes_put=int(arrays["bytes_put"]),

@@ -1,11 +1,11 @@
 """What a world or a data set yields: every reading of every vehicle, and the truth to score it by."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleet_seif.records import Floats, Ints, Reading, Sightings
+from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,6 +38,11 @@ class Log:
     def steps(self) -> int:
         return len(self.odometry)
 
+    def chosen(self, sightings: Ints) -> "Log":
+        """The log with these of its sightings, by index, in this order, in which steps must ascend."""
+        names = ("sighting_step", "sighting_z", "sighting_cov", "sighting_signature", "sighting_truth")
+        return replace(self, **{name: getattr(self, name)[sightings] for name in names})
+
     def sightings_at(self, step: int) -> Sightings:
         """What was seen from pose `step`."""
         low, high = np.searchsorted(self.sighting_step, [step, step + 1])
@@ -66,3 +71,18 @@ class Recording:
     landmarks: Floats
     logs: dict[str, Log]
     skipped: dict[str, int]
+
+    def identified(self) -> "Recording":
+        """The recording; where none of its sightings has a signature, with true landmarks as signatures.
+
+        For what is given the answer on purpose. What is no landmark has no signature then either.
+        """
+        if any(np.any(log.sighting_signature != UNKNOWN_SIGNATURE) for log in self.logs.values()):
+            return self
+        logs = {
+            name: replace(
+                log, sighting_signature=np.where(log.sighting_truth < 0, UNKNOWN_SIGNATURE, log.sighting_truth)
+            )
+            for name, log in self.logs.items()
+        }
+        return replace(self, logs=logs)

@@ -1,6 +1,7 @@
 """From a finished run to its report and the files in its folder."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +11,7 @@ from fleet_seif.joint import JointSolution, marginal_covariances, solve
 from fleet_seif.records import Floats
 from fusion.ledger import Ledger
 from scenarios import output
+from scenarios.association import Truths, assigned_truth, associate, fleet_association
 from scenarios.config import Scenario
 from scenarios.figure import draw_figure, figure_times
 from scenarios.history import meetings, pose_times, replay, uncertainty_of
@@ -34,6 +36,11 @@ class FinishedRun:
     wall_s: float
     fusion: dict[str, Any] = field(default_factory=dict)
 
+    @cached_property
+    def truths(self) -> Truths:
+        """Which true landmark each vehicle's landmarks are, by what it assigned to them."""
+        return {name: assigned_truth(log, self.drives[name].assigned) for name, log in self.recording.logs.items()}
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Outcome:
@@ -50,7 +57,7 @@ def evaluate(run: FinishedRun) -> Outcome:
     lives = run.ledger.lives()
     solution = solve(lives, run.ledger.classes(lives))
     landmark_cov, _ = marginal_covariances(solution)
-    score = score_map(solution, landmark_cov, run.recording)
+    score = score_map(solution, landmark_cov, run.recording, run.truths)
     report = {
         "format": output.FORMAT,
         "scenario": run.name,
@@ -59,6 +66,8 @@ def evaluate(run: FinishedRun) -> Outcome:
         "wall_s": run.wall_s,
         "digest": run.ledger.map_digest().hex(),
         **{name: value for name, value in vars(score).items() if name != "landmark_truth"},
+        **fleet_association(run.recording, {name: drive.assigned for name, drive in run.drives.items()}).fields(),
+        "doubtful_vehicles": sorted({s.vehicle for s in run.ledger.streams.values() if not s.healthy}),
         "vehicles": {name: _vehicle(run, name) for name in run.recording.logs},
         "frames": _frames(solution),
         "meetings": meeting_report(run.ledger, run.recording) if run.scenario.figure == "meetings" else [],
@@ -89,6 +98,7 @@ def _vehicle(run: FinishedRun, name: str) -> dict[str, Any]:
     result, log = run.drives[name], run.recording.logs[name]
     return {
         **score_vehicle(result, log, run.recording.landmarks),
+        **associate(log, result.assigned).fields(),
         "step_us_p50": _us(result.filter_s, 50),
         "step_us_p99": _us(result.filter_s, 99),
         "publish_us_p50": _us(result.publish_s, 50),
@@ -108,7 +118,7 @@ def _us(seconds: Floats, percentile: float) -> float | None:
 def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
     """Everything the README promises, into a folder made by output.prepare_folder."""
     for name, log in run.recording.logs.items():
-        output.write_readings(folder, log)
+        output.write_readings(folder, log, run.drives[name].assigned)
         output.write_trajectory(folder / "trajectory" / f"{name}.tum", log.time_s, run.drives[name].pose)
         output.write_trajectory(folder / "trajectory" / f"{name}_truth.tum", log.time_s, log.truth_pose)
     output.write_truth(folder, run.recording)
@@ -122,6 +132,7 @@ def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
         recording=run.recording,
         moments=list(replay(run.ledger, times.times_s)),
         tracks={name: drive.pose for name, drive in run.drives.items()},
+        truths=run.truths,
     )
     output.write_json(folder / "report.json", outcome.report)  # last: who finds it finds the rest
 

@@ -9,6 +9,7 @@ import scipy.stats
 
 from fleet_seif.joint import JointSolution, landmark_chi_square
 from fleet_seif.records import Floats, Ints
+from scenarios.association import Truths, assigned_truth
 from scenarios.recording import Log, Recording
 from vehicles.drive import DriveResult
 
@@ -38,15 +39,6 @@ def align(points: Floats, truth: Floats) -> Floats:
     return moved
 
 
-def signature_truth(log: Log) -> dict[int, int]:
-    """Truth of each landmark of a vehicle, by signature: the majority of its sightings' truth."""
-    truths = {}
-    for signature in np.unique(log.sighting_signature).tolist():
-        values, counts = np.unique(log.sighting_truth[log.sighting_signature == signature], return_counts=True)
-        truths[signature] = int(values[np.argmax(counts)])
-    return truths
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MapScore:
     """The joint map against the truth; see the README for the fields of report.json that have the same names."""
@@ -64,9 +56,9 @@ class MapScore:
     missed_merges: int
 
 
-def score_map(solution: JointSolution, landmark_cov: Floats, recording: Recording) -> MapScore:
-    """Errors, consistency and merges of a joint map. landmark_cov (n, 2, 2), m^2."""
-    member_truth = _member_truth(solution, recording)
+def score_map(solution: JointSolution, landmark_cov: Floats, recording: Recording, truths: Truths) -> MapScore:
+    """Errors, consistency and merges of a joint map. landmark_cov (n, 2, 2), m^2. truths: as `assigned_truth`."""
+    member_truth = _member_truth(solution, truths)
     landmark_truth = np.array([majority(values) for values in member_truth], np.int64)
     matched = landmark_truth >= 0
     truth = recording.landmarks[landmark_truth[matched]]
@@ -91,17 +83,13 @@ def score_map(solution: JointSolution, landmark_cov: Floats, recording: Recordin
     )
 
 
-def landmark_truths(solution: JointSolution, recording: Recording) -> Ints:
+def landmark_truths(solution: JointSolution, truths: Truths) -> Ints:
     """Which true landmark each landmark of a joint map is by most of its vehicles' sightings, -1 unknown, (n,)."""
-    return np.array([majority(values) for values in _member_truth(solution, recording)], np.int64)
+    return np.array([majority(values) for values in _member_truth(solution, truths)], np.int64)
 
 
-def _member_truth(solution: JointSolution, recording: Recording) -> list[list[int]]:
-    truths = {name: signature_truth(log) for name, log in recording.logs.items()}
-    return [
-        [truths[name.vehicle].get(signature, -1) for name in names]
-        for names, signature in zip(solution.classes, solution.signatures, strict=True)
-    ]
+def _member_truth(solution: JointSolution, truths: Truths) -> list[list[int]]:
+    return [[truths[name.vehicle].get(name.number, -1) for name in names] for names in solution.classes]
 
 
 def majority(values: list[int]) -> int:
@@ -111,7 +99,10 @@ def majority(values: list[int]) -> int:
 
 
 def _merges(solution: JointSolution, member_truth: list[list[int]]) -> tuple[int, int, int]:
-    """Over pairs of different vehicles' landmarks: merged, merged wrongly, not merged though one in truth."""
+    """Over pairs of different vehicles' landmarks: merged, merged wrongly, not merged though one in truth.
+
+    Of two that are both no true landmark it cannot be told whether they are the same.
+    """
     members = [
         (c, name.vehicle, truth)
         for c, (names, truths) in enumerate(zip(solution.classes, member_truth, strict=True))
@@ -138,9 +129,9 @@ def _merges(solution: JointSolution, member_truth: list[list[int]]) -> tuple[int
 
 def score_vehicle(result: DriveResult, log: Log, landmarks: Floats) -> Mapping[str, float | None]:
     """A vehicle's own live map and pose against the truth."""
-    truths = signature_truth(log)
-    truth = np.array([truths.get(signature, -1) for signature in result.signatures.tolist()], np.int64)
-    known = truth >= 0
+    truths = assigned_truth(log, result.assigned)
+    truth = np.array([truths.get(number, -1) for number in range(len(result.landmarks))], np.int64)
+    known = (truth >= 0) & np.isfinite(result.landmarks).all(axis=1)
     with_truth = np.all(np.isfinite(log.truth_pose), axis=1)
     with_truth &= np.all(np.isfinite(result.pose), axis=1)  # steps of a process that was killed are not known
     pose_error = result.pose[with_truth, :2] - log.truth_pose[with_truth, :2]

@@ -133,7 +133,7 @@ class SimVehicle(Process):
     def __init__(self, simulation: "Simulation", log: Log, rng: np.random.Generator) -> None:
         super().__init__(simulation, log.vehicle, rng)
         self.core: VehicleCore | None = None
-        self.notes = Notes(log.steps)
+        self.notes = Notes(log.steps, len(log.sighting_step))
         self._log = log
         self._readings = list(log.readings())
         self._liar = Liar(simulation.scenario.faults.hostile, log.vehicle)
@@ -241,7 +241,8 @@ class SimVehicle(Process):
     def result(self) -> DriveResult:
         """What it has to say after the run."""
         assert self.core is not None
-        return self.notes.result(self.core.landmarks, self.core.filter.signatures, self.core.counters)
+        core = self.core
+        return self.notes.result(core.landmarks, core.filter.signatures, core.assigned, core.counters)
 
 
 class SimNode(Process):

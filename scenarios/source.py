@@ -1,7 +1,10 @@
 """Readings for a scenario: from its simulated world or its data set."""
 
+from dataclasses import replace
+
 from scenarios import mrclam
 from scenarios.config import Scenario, ScenarioError
+from scenarios.detection import detected, without_signatures
 from scenarios.mrclam_files import DatasetError
 from scenarios.recording import Recording
 from scenarios.world import simulate
@@ -38,19 +41,25 @@ def record(scenario: Scenario, only: str | None = None) -> Recording:
 
     Raises ScenarioError for a vehicle that does not take part or a data set that cannot be read.
     """
-    if scenario.dataset is not None:
-        try:
-            return mrclam.load(scenario.dataset, only=only)
-        except DatasetError as error:
-            raise ScenarioError(str(error)) from None
-    assert scenario.world is not None
-    names = vehicle_names(scenario)
     try:
-        recording = simulate(scenario.world, scenario.noise, names, scenario.run.seed)
-    except ValueError as error:  # settings that are fine each, but not together
-        raise ScenarioError(f"[world] {error}") from None
+        names = vehicle_names(scenario)
+        recording = _simulated(scenario) if scenario.dataset is None else mrclam.load(scenario.dataset, only=only)
+    except DatasetError as error:
+        raise ScenarioError(str(error)) from None
+    if scenario.detection.signatures == "none":
+        recording = without_signatures(recording, names, scenario.run.seed)
     if only is None:
         return recording
     if only not in recording.logs:
         raise ScenarioError(f"no vehicle {only!r} in this scenario: its vehicles are {', '.join(names)}")
-    return Recording(landmarks=recording.landmarks, logs={only: recording.logs[only]}, skipped=recording.skipped)
+    return replace(recording, logs={only: recording.logs[only]})
+
+
+def _simulated(scenario: Scenario) -> Recording:
+    assert scenario.world is not None
+    world, noise, seed = scenario.world, scenario.noise, scenario.run.seed
+    try:
+        recording = simulate(world, noise, vehicle_names(scenario), seed)
+    except ValueError as error:  # settings that are fine each, but not together
+        raise ScenarioError(f"[world] {error}") from None
+    return detected(recording, world, noise, scenario.detection, seed)

@@ -17,6 +17,7 @@ from fleet_seif.errors import RunError
 from fleet_seif.records import Floats, Ints
 from scenarios import output
 from scenarios.recording import Log, Recording
+from vehicles.drive import NOT_KNOWN
 
 SAME_TIME_S: Final = 1e-6
 
@@ -34,11 +35,13 @@ class MapEstimate:
 class StoredRun:
     """A finished run as its folder holds it.
 
-    tracks: live poses by vehicle (T+1, 3), NaN where unknown. joint_poses: of the joint map by vehicle, the same.
+    assigned: by vehicle (S,), see `DriveResult`. tracks: live poses by vehicle (T+1, 3), NaN where unknown.
+    joint_poses: of the joint map by vehicle, the same.
     """
 
     report: dict[str, Any]
     recording: Recording
+    assigned: dict[str, Ints]
     map: MapEstimate
     tracks: dict[str, Floats]
     joint_poses: dict[str, Floats]
@@ -60,7 +63,8 @@ def read_run(folder: Path) -> StoredRun:
     with _whole(folder / "truth.npz") as path:
         truth = _arrays(path)
         landmarks, poses = truth["landmarks"], {name: truth[f"pose_{name}"] for name in names}
-    logs = {name: _log(folder, name, poses[name]) for name in names}
+    read = {name: _readings(folder, name, poses[name]) for name in names}
+    logs = {name: log for name, (log, _) in read.items()}
     with _whole(folder / "map.npz") as path:
         joint = _arrays(path)
         H = scipy.sparse.csr_array((joint["H_data"], joint["H_indices"], joint["H_indptr"]))
@@ -69,6 +73,7 @@ def read_run(folder: Path) -> StoredRun:
     return StoredRun(
         report=kept,
         recording=Recording(landmarks=landmarks, logs=logs, skipped=kept["sightings_left_out"]),
+        assigned={name: assigned for name, (_, assigned) in read.items()},
         map=estimate,
         tracks={name: _track(folder / "trajectory" / f"{name}.tum", log.time_s) for name, log in logs.items()},
         joint_poses=joint_poses,
@@ -98,12 +103,13 @@ def _arrays(path: Path) -> dict[str, Any]:
         return {name: file[name] for name in file.files}
 
 
-def _log(folder: Path, vehicle: str, truth_pose: Floats) -> Log:
-    """The inverse of `output.write_readings`."""
+def _readings(folder: Path, vehicle: str, truth_pose: Floats) -> tuple[Log, Ints]:
+    """The inverse of `output.write_readings`. Versions before landmark association wrote no assignments."""
     with _whole(folder / "readings" / f"{vehicle}.npz") as path:
         fields = _arrays(path)
         z = np.column_stack([fields.pop("sighting_range_m"), fields.pop("sighting_bearing_rad")])
-        return Log(vehicle=vehicle, truth_pose=truth_pose, sighting_z=z, **fields)
+        assigned = fields.pop("sighting_assigned", np.full(len(z), NOT_KNOWN))
+        return Log(vehicle=vehicle, truth_pose=truth_pose, sighting_z=z, **fields), assigned
 
 
 def _joint_poses(joint: Mapping[str, Any], H: scipy.sparse.csr_array, logs: Mapping[str, Log]) -> dict[str, Floats]:

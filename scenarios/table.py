@@ -1,5 +1,6 @@
 """A report as a table for the terminal."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Group
@@ -9,6 +10,15 @@ from rich.text import Text
 
 def _number(value: Any, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def association_words(scored: Mapping[str, Any]) -> str:
+    """How well the fleet told which landmark each sighting is of. scored: has `Association.fields`."""
+    return (
+        f"association: precision {_number(scored['association_precision'], 4)}, "
+        f"recall {_number(scored['association_recall'], 4)}, "
+        f"duplicate landmarks {scored['duplicate_landmarks']}, spurious {scored['spurious_landmarks']}"
+    )
 
 
 def report_table(report: dict[str, Any]) -> Group:
@@ -33,8 +43,10 @@ def report_table(report: dict[str, Any]) -> Group:
         f"fused map: {report['fused_landmarks']} landmarks ({report['truth_landmarks']} seen in truth), "
         f"error {_number(report['landmark_rmse_m'], 4)} m, aligned {_number(report['landmark_rmse_aligned_m'], 4)} m, "
         f"NEES per dof {_number(report['nees_per_dof'], 2)}",
+        association_words(report),
         f"merges {report['merges']}, wrong {report['wrong_merges']}, missed {report['missed_merges']}",
         *(f"{n} readings of {name} were refused: its map lacks them" for name, n in refused.items()),
+        *(f"{n} is doubtful: it says that its filter has failed" for n in report["doubtful_vehicles"]),
         *(f"{n} is quarantined: {row['quarantine']}" for n, row in report["vehicles"].items() if row["quarantine"]),
         f"digest {report['digest'][:16]}",
     ]

@@ -3,16 +3,18 @@
 A step moves a vehicle straight ahead and then turns it. Its odometry is that increment with normal noise; from every
 pose it sights each landmark between two ranges, all around, as range and bearing with normal noise. Streams of random
 numbers are kept apart (landmarks, routes, each vehicle's noise), so that a change of one leaves the others alone.
+
+What vehicles are shown beside the landmarks, and what they are not shown, is in `detection`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from fleet_seif.config import Positive, Settings
+from fleet_seif.config import NotNegative, Positive, Settings
 from fleet_seif.geometry import wrap
 from fleet_seif.records import Floats, Ints
 from scenarios.meetings import meeting_routes
@@ -27,10 +29,16 @@ RANGE_FLOOR_M = 1e-3
 """A noisy range at or below it is drawn again: no sensor reports a landmark behind itself."""
 
 
+STREAM_LANDMARKS, STREAM_ROUTES, STREAM_NOISE, STREAM_TWINS = 0, 1, 2, 4
+"""First part of the keys of random streams; 3 is the compass world's, from 5 on they are those of `detection`."""
+
+
 class WorldSettings(Settings):
     """The square, its landmarks, and how the vehicles fly over it.
 
     side_m: None for the paper's density of landmarks. min_distance_m: between any two landmarks.
+    layout: "random", or "grid" for rows and columns at one distance, which look the same from everywhere.
+    close_pairs: so many of the landmarks stand within close_pair_m of another one, whatever min_distance_m says.
     step_s: the vehicle's own time from pose to pose. turn_max_rad: most that the heading changes in a step.
     range_min_m, range_max_m: a landmark in between is sighted.
     routes: "meetings" for three vehicles that first share landmarks at set steps, "coverage" for any number.
@@ -38,7 +46,10 @@ class WorldSettings(Settings):
 
     landmarks: Annotated[int, Field(ge=1, le=100_000)] = 50
     side_m: Positive | None = None
-    min_distance_m: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.05
+    min_distance_m: NotNegative = 0.05
+    layout: Literal["random", "grid"] = "random"
+    close_pairs: Annotated[int, Field(ge=0)] = 0
+    close_pair_m: Positive = 0.02
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 500
     step_m: Positive = 0.05
     step_s: Positive = 0.1
@@ -59,6 +70,18 @@ class WorldSettings(Settings):
             range_min_m=self.range_min_m,
             range_max_m=self.range_max_m,
         )
+
+    @model_validator(mode="after")
+    def _landmarks_can_be_placed(self) -> Self:
+        if 2 * self.close_pairs > self.landmarks:
+            raise ValueError(f"{self.landmarks} landmarks have at most {self.landmarks // 2} close_pairs")
+        if self.layout == "grid":
+            rows = math.isqrt(self.landmarks)
+            if rows**2 != self.landmarks:
+                raise ValueError(f"a grid has {rows**2} or {(rows + 1) ** 2} landmarks, not {self.landmarks}")
+            if self.close_pairs:
+                raise ValueError('a grid has no close_pairs; remedy: layout = "random"')
+        return self
 
     @model_validator(mode="after")
     def _vehicles_can_turn_and_see(self) -> Self:
@@ -93,26 +116,53 @@ class NoiseSettings(Settings):
     bearing_std_rad: Positive = math.sqrt(0.003)
 
 
-def place_landmarks(world: WorldSettings, rng: np.random.Generator) -> Floats:
-    """Landmarks (m, 2), uniform in the square; one too close to those placed before it is drawn again.
+def stream(seed: int, *key: int) -> np.random.Generator:
+    """The random numbers of one purpose, apart from those of all others."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
-    Raises ValueError when DARTS_MAX draws in a row find no place.
-    """
-    side_m = world.square_side_m
-    placed = np.empty((world.landmarks, 2))
-    for i in range(world.landmarks):
-        for _ in range(DARTS_MAX):
-            dart = rng.uniform(0.0, side_m, 2)
-            if np.all(np.sum((placed[:i] - dart) ** 2, axis=1) >= world.min_distance_m**2):
-                placed[i] = dart
-                break
-        else:
-            raise ValueError(
-                f"no room for landmark {i + 1} of {world.landmarks}, {world.min_distance_m} m from the others, "
-                f"in a square of side {side_m:.3f} m; remedy: fewer landmarks, a larger side_m or a "
-                "smaller min_distance_m"
-            )
+
+def place_landmarks(world: WorldSettings, seed: int) -> Floats:
+    """Landmarks (m, 2) of the layout; the second ones of close pairs are the last. Raises ValueError: no room."""
+    side_m, count, alone = world.square_side_m, world.landmarks, world.landmarks - world.close_pairs
+    if world.layout == "grid":
+        rows = math.isqrt(count)
+        if side_m / rows < world.min_distance_m:
+            raise _no_room(world, count)
+        at = (np.arange(rows) + 0.5) * (side_m / rows)
+        return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+    placed = np.empty((count, 2))
+    rng = stream(seed, STREAM_LANDMARKS)
+    for i in range(alone):
+        placed[i] = _dart(world, i, placed[:i], lambda: rng.uniform(0.0, side_m, 2))
+    twins = stream(seed, STREAM_TWINS)
+    for i, first in zip(range(alone, count), twins.permutation(alone).tolist(), strict=False):
+        others = np.delete(placed[:i], first, axis=0)
+        placed[i] = _dart(world, i, others, lambda first=first: placed[first] + _in_disc(world.close_pair_m, twins))  # type: ignore[misc]
     return placed
+
+
+def _dart(world: WorldSettings, number: int, others: Floats, draw: Callable[[], Floats]) -> Floats:
+    """A place for a landmark, drawn again while it is too close to the others, or not in the square."""
+    for _ in range(DARTS_MAX):
+        dart = draw()
+        inside = dart.min() >= 0.0 and dart.max() <= world.square_side_m
+        if inside and np.all(np.sum((others - dart) ** 2, axis=1) >= world.min_distance_m**2):
+            return dart
+    raise _no_room(world, number + 1)
+
+
+def _no_room(world: WorldSettings, number: int) -> ValueError:
+    return ValueError(
+        f"no room for landmark {number} of {world.landmarks}, {world.min_distance_m} m from the others, "
+        f"in a square of side {world.square_side_m:.3f} m; remedy: fewer landmarks, a larger side_m or a "
+        "smaller min_distance_m"
+    )
+
+
+def _in_disc(radius_m: float, rng: np.random.Generator) -> Floats:
+    """Uniform, shape (2,)."""
+    distance, angle = radius_m * math.sqrt(rng.uniform()), rng.uniform(-math.pi, math.pi)
+    return np.array([distance * math.cos(angle), distance * math.sin(angle)])
 
 
 def plan_routes(world: WorldSettings, landmarks: Floats, count: int, rng: np.random.Generator) -> Floats:
@@ -187,13 +237,10 @@ def simulate(world: WorldSettings, noise: NoiseSettings, vehicles: Sequence[str]
     """
     if not vehicles or len(set(vehicles)) != len(vehicles):
         raise ValueError(f"vehicles need unique names, at least one; got {list(vehicles)}")
-
-    def stream(*key: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
-
-    landmarks = place_landmarks(world, stream(0))
-    routes = plan_routes(world, landmarks, len(vehicles), stream(1))
+    landmarks = place_landmarks(world, seed)
+    routes = plan_routes(world, landmarks, len(vehicles), stream(seed, STREAM_ROUTES))
     logs = {
-        vehicle: record(vehicle, routes[i], landmarks, world, noise, stream(2, i)) for i, vehicle in enumerate(vehicles)
+        vehicle: record(vehicle, routes[i], landmarks, world, noise, stream(seed, STREAM_NOISE, i))
+        for i, vehicle in enumerate(vehicles)
     }
     return Recording(landmarks=landmarks, logs=logs, skipped={})

@@ -17,6 +17,8 @@ from fleet_seif.joint import marginal_chi_square
 from fleet_seif.records import Floats
 from scenarios import batch
 from scenarios.batch import BatchSolution, Guess, solve_batch
+from scenarios.detection import DetectionSettings, detected, without_signatures
+from scenarios.evaluate import batch_map
 from scenarios.recording import Log, Recording
 from scenarios.world import NoiseSettings, WorldSettings, simulate
 from tests.frames_against_batch import compare
@@ -228,17 +230,29 @@ def test_sightings_without_a_signature_are_left_out() -> None:
 
     def thinned(log: Log) -> Log:
         kept = np.arange(len(log.sighting_signature)) % 3 != 0
-        names = ("sighting_step", "sighting_z", "sighting_cov", "sighting_signature", "sighting_truth")
-        return replace(log, **{name: getattr(log, name)[kept] for name in names})
+        return log.chosen(np.flatnonzero(kept))
 
     recording = world(6)
     found, expected = (solve_batch(with_logs(recording, change)) for change in (anonymous, thinned))
     assert expected.left_out == 0
     assert found.left_out == sum((len(log.sighting_signature) + 2) // 3 for log in recording.logs.values())
     np.testing.assert_array_equal(found.landmark_mean, expected.landmark_mean)
-    nothing = with_logs(recording, lambda log: replace(log, sighting_signature=-np.ones_like(log.sighting_signature)))
+    nothing = with_logs(recording, lambda log: log.chosen(np.empty(0, np.int64)))
     with pytest.raises(RunError, match="no sighting in these readings has a signature"):
         solve_batch(nothing)
+
+
+def test_where_no_sighting_has_a_signature_the_batch_is_told_the_truth() -> None:
+    pytest.importorskip("gtsam")
+    known = world(6)
+    settings = DetectionSettings(signatures="none", clutter_share=0.2)
+    cluttered = detected(known, WorldSettings(landmarks=12), MILD, settings, 1)
+    hidden = without_signatures(cluttered, tuple(known.logs), 1)
+    found, expected = solve_batch(hidden), solve_batch(known)
+    assert found.signatures.tolist() == expected.signatures.tolist()
+    np.testing.assert_allclose(found.landmark_mean, expected.landmark_mean, atol=1e-6)
+    assert found.left_out == sum(np.count_nonzero(log.sighting_truth < 0) for log in hidden.logs.values()) > 0
+    np.testing.assert_array_equal(batch_map(found, hidden).truth, batch_map(expected, known).truth)
 
 
 @given(st.lists(st.tuples(st.integers(1, 90), st.floats(0.0, 0.3)), min_size=1, max_size=4))

@@ -17,7 +17,7 @@ def test_shipped_scenarios_load_and_describe_themselves(name: str) -> None:
 def test_the_shipped_scenarios_are_those_of_the_readme() -> None:
     assert set(shipped()) == {
         "three_air_vehicles", "three_air_vehicles_mild", "fleet", "lossy_link", "mrclam",
-        "crash_restart", "hostile_vehicle", "late_joiner", "partition",
+        "crash_restart", "hostile_vehicle", "late_joiner", "partition", "three_air_vehicles_unknown", "grid",
     }  # fmt: skip
 
 
@@ -37,6 +37,8 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
         ("[fleet]\nvehicles = 2\n", ["[world]", "[dataset]"]),
         ("[world]\nroutes = 'meetings'\n[fleet]\nvehicles = 4\n", ["three vehicles", "coverage"]),
         (WORLD + "[fleet]\nname = 'a/b'\n", ["[fleet.name]", "a/b"]),
+        (WORLD + "[detection]\nclutter_share = 0.1\n", ["[detection]", "no signature", 'signatures = "none"']),
+        ("[dataset]\nkind = 'mrclam'\n[detection]\nmissed_share = 0.1\n", ["[detection]", "signatures only"]),
         ("[world\n", ["not TOML"]),
     ],
 )

@@ -49,6 +49,7 @@ def test_a_folder_is_read_as_the_run_that_wrote_it(folder: Path, run: FinishedRu
     for name, log in run.recording.logs.items():
         for field, value in vars(log).items():
             np.testing.assert_array_equal(getattr(stored.recording.logs[name], field), value, err_msg=field)
+        np.testing.assert_array_equal(stored.assigned[name], run.drives[name].assigned)
         track, pose = stored.tracks[name], run.drives[name].pose
         np.testing.assert_allclose(track[:, :2], pose[:, :2], atol=1e-8)
         np.testing.assert_allclose(np.exp(1j * track[:, 2]), np.exp(1j * pose[:, 2]), atol=1e-7)
@@ -61,10 +62,21 @@ def test_the_scores_are_those_of_the_report(folder: Path) -> None:
     assert scored["map"]["rmse_aligned_m"] == pytest.approx(report["landmark_rmse_aligned_m"], rel=1e-12)
     assert scored["map"]["nees_per_dof"] == pytest.approx(report["nees_per_dof"], rel=1e-6)
     for name, row in report["vehicles"].items():
+        assert {field: scored["vehicles"][name][field] for field in ASSOCIATION} == {f: row[f] for f in ASSOCIATION}
         assert scored["vehicles"][name]["live_rmse_m"] == pytest.approx(row["pose_rmse_m"], rel=1e-6)
         assert scored["vehicles"][name]["own_map_rmse_m"] == row["landmark_rmse_m"]
     mean = np.mean([row["bytes_per_step_mean"] for row in report["vehicles"].values()])
     assert scored["bytes_per_step_mean"] == pytest.approx(mean)
+
+
+def test_a_folder_from_before_association_is_scored_without_it(copy: Path) -> None:
+    path = copy / "readings" / "v1.npz"
+    with np.load(path) as file:
+        fields = {name: file[name] for name in file.files if name != "sighting_assigned"}
+    np.savez_compressed(path, **fields)
+    scored = score_run(read_run(copy))
+    assert scored["vehicles"]["v1"]["association_precision"] is None
+    assert scored["vehicles"]["v2"]["association_precision"] == scored["association_precision"] == 1.0
 
 
 def test_steps_that_a_killed_process_has_not_told_of_stay_unknown(copy: Path) -> None:
@@ -152,7 +164,8 @@ def test_the_batch_stands_beside_a_run(folder: Path, run: FinishedRun) -> None:
     assert scored["ratio"]["trajectory_rmse"] == pytest.approx(ours_m / theirs_m)
 
 
-SCORES = {"format", "scenario", "seed", "map", "trajectory", "vehicles", "bytes_per_step_mean"}
+ASSOCIATION = {"association_precision", "association_recall", "duplicate_landmarks", "spurious_landmarks"}
+SCORES = {"format", "scenario", "seed", "map", "trajectory", "vehicles", "bytes_per_step_mean", *ASSOCIATION}
 
 
 def test_the_command_prints_a_table_or_json_and_needs_no_gtsam(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from fleet_seif.records import Floats
+from scenarios.association import Truths, assigned_truth
 from scenarios.config import load_scenario
 from scenarios.figure import DPI, SIZE_IN, FigureTimes, Kind, draw_figure, figure_times
 from scenarios.history import Moment, meetings, replay
@@ -41,6 +42,11 @@ def moments_at(times: FigureTimes) -> list[Moment]:
     return list(replay(tiny_run()[1].ledger, times.times_s[-3:]))
 
 
+def truths_of(recording: Recording) -> Truths:
+    drives = tiny_run()[1].drives
+    return {name: assigned_truth(log, drives[name].assigned) for name, log in recording.logs.items()}
+
+
 def draw(path: Path, kind: Kind, recording: Recording, moments: Sequence[Moment] | None = None) -> bytes:
     """The file's bytes, after a look at its size."""
     times = figure_times(kind, recording)
@@ -51,6 +57,7 @@ def draw(path: Path, kind: Kind, recording: Recording, moments: Sequence[Moment]
         times=times,
         moments=moments_at(times) if moments is None else moments,
         tracks=tiny_run()[2],
+        truths=truths_of(recording),
     )
     data = path.read_bytes()
     assert data.startswith(PNG_MAGIC)

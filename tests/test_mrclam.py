@@ -11,9 +11,11 @@ from pydantic import ValidationError
 
 from fleet_seif.geometry import act_inverse, compose, compose_jacobians, wrap
 from fleet_seif.records import Floats
+from scenarios.config import load_scenario
 from scenarios.mrclam import DatasetSettings, increments, load
 from scenarios.mrclam_files import DatasetError
 from scenarios.recording import Log, Recording
+from scenarios.source import record
 from tests import real_data
 
 T0_MS = 1_600_000_000_000  # Unix time of the small world's origin
@@ -162,6 +164,18 @@ def test_delay_and_loss_of_speed_in_bends_are_taken_out_of_the_odometry(tmp_path
         assert largest_pose_error(log) < 1e-5
         assert largest_pose_error(only_delay.logs[name]) > 0.05
         assert largest_pose_error(only_loss.logs[name]) > 0.05
+
+
+def test_barcodes_can_be_hidden_from_all_but_the_score(folder: Path) -> None:
+    settings = (f"dataset.path={folder}", "detection.signatures=none")
+    known, hidden = (record(load_scenario("mrclam", chosen)) for chosen in (settings[:1], settings))
+    assert list(hidden.logs) == list(known.logs)
+    for name, log in hidden.logs.items():
+        assert set(log.sighting_signature.tolist()) == {-1}
+        order = [np.lexsort((*each.sighting_z.T, each.sighting_step)) for each in (log, known.logs[name])]
+        named = replace(log.chosen(order[0]), sighting_signature=known.logs[name].sighting_signature[order[1]])
+        assert same_log(named, known.logs[name].chosen(order[1]))
+        assert same_log(record(load_scenario("mrclam", settings), name).logs[name], log)
 
 
 def test_every_sighting_is_that_of_its_landmark_from_its_true_pose(folder: Path) -> None:

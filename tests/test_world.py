@@ -14,7 +14,7 @@ from fleet_seif.records import Floats, Ints
 from scenarios import meetings
 from scenarios.recording import Log, Recording
 from scenarios.routes import NEVER, first_shared_step
-from scenarios.world import NoiseSettings, WorldSettings, simulate
+from scenarios.world import NoiseSettings, WorldSettings, place_landmarks, simulate
 
 TRIO = ["a", "b", "c"]
 SEEDS = range(20)
@@ -148,6 +148,38 @@ def test_landmarks_lie_in_the_square_and_keep_their_distance() -> None:
     assert landmarks.max() <= 1.0
 
 
+def test_landmarks_of_a_layout_without_close_pairs_are_those_of_one_dart_after_another() -> None:
+    rng = np.random.default_rng(np.random.SeedSequence(3, spawn_key=(0,)))
+    placed: list[Floats] = []
+    while len(placed) < 50:
+        dart = rng.uniform(0.0, 1.0, 2)
+        if all(math.dist(dart, other) >= 0.05 for other in placed):
+            placed.append(dart)
+    np.testing.assert_array_equal(meeting(50, 3).landmarks, placed)
+
+
+def test_a_grid_looks_the_same_from_each_of_its_landmarks() -> None:
+    grid = place_landmarks(WorldSettings(landmarks=49, layout="grid"), 0)
+    side = math.sqrt(49 / 50)
+    assert grid.shape == (49, 2)
+    for axis in grid.T:
+        np.testing.assert_allclose(np.unique(np.round(axis, 12)), (np.arange(7) + 0.5) * side / 7, atol=1e-11)
+    assert len({tuple(place) for place in np.round(grid, 9).tolist()}) == 49
+
+
+def test_close_pairs_stand_closer_than_others_may_and_each_landmark_is_in_one_at_most() -> None:
+    settings = {"landmarks": 50, "close_pairs": 8, "close_pair_m": 0.015}
+    landmarks = place_landmarks(WorldSettings.model_validate(settings), 4)
+    apart = np.linalg.norm(landmarks[:, None] - landmarks[None, :], axis=2)
+    close = np.argwhere(np.triu(apart < 0.05, 1))
+    assert len(close) == 8
+    assert len(set(close.ravel().tolist())) == 16
+    assert apart[*close.T].max() <= 0.015
+    assert set(close[:, 1].tolist()) == set(range(42, 50))
+    assert landmarks.min() >= 0.0
+    assert landmarks.max() <= 1.0
+
+
 def test_sightings_are_exactly_the_landmarks_in_range_by_step_then_index() -> None:
     run = meeting(50, 1)
     for log in run.logs.values():
@@ -246,6 +278,10 @@ def test_a_vehicles_odometry_noise_does_not_depend_on_the_size_of_the_fleet() ->
         {"side_m": 0.1},
         {"routes": "wander"},
         {"speed": 1.0},
+        {"layout": "ring"},
+        {"layout": "grid"},
+        {"layout": "grid", "landmarks": 49, "close_pairs": 2},
+        {"close_pairs": 26},
     ],
 )
 def test_bad_world_settings_are_refused(bad: dict[str, object]) -> None:
@@ -265,6 +301,7 @@ def test_noise_without_spread_is_refused() -> None:
         (WorldSettings(), ["a", "a", "b"], "unique names"),
         (WorldSettings(routes="coverage"), [], "unique names"),
         (WorldSettings(min_distance_m=0.5), TRIO, "no room for landmark"),
+        (WorldSettings(layout="grid", landmarks=49, min_distance_m=0.2), TRIO, "no room for landmark"),
         (WorldSettings(steps=80), TRIO, "before the meetings"),
         (WorldSettings(side_m=0.5), TRIO, "leaves 0.050 m for a pen"),
     ],

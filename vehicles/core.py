@@ -28,7 +28,7 @@ from fleet_seif.frames import FramedFilter
 from fleet_seif.geometry import act_all, compose
 from fleet_seif.messages import Ack, Continues, DeltaMessage, Epoch, FramePart, Hello, check_name
 from fleet_seif.models import RANGE_BEARING
-from fleet_seif.records import Floats, Reading, Sightings
+from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 from fleet_seif.signing import KeyRing, Role, Signer
 from fleet_seif.store import Change, Delete, Put
 from fleet_seif.wire import POSE_MAX, decode_ack, decode_range, encode_heartbeat, is_start_covariance
@@ -117,6 +117,7 @@ class VehicleCore:
         self._required, self._signer, self._keys = required, signer, keys
         self._durable = durable
         self._heartbeat_at_s = -math.inf
+        self._given: list[Ints] = []
         self._reading_bytes = 0
         self._state_bytes = STATE_BYTES_LEAST
         self._kept: list[Change] = []
@@ -239,6 +240,7 @@ class VehicleCore:
             state = msgpack.unpackb(kept[records.STATE], use_list=False)
             self.filter.restore(state["filter"])
             self.steps, self.time_s, self.healthy = state["steps"], state["time_s"], state["healthy"]
+            self._given = [np.frombuffer(state["given"], np.int64)]
         for key in sorted(name for name in kept if name[:1] == records.READING):
             reading, mark = records.read_reading(kept[key])
             step = int.from_bytes(key[1:], "big")
@@ -249,6 +251,7 @@ class VehicleCore:
                     " another kind of machine: begin a fresh life"
                 )
             self.steps, self.time_s = step, reading.time_s
+            self._given.append(reading.sightings.signature)
             self._reading_bytes += len(kept[key])
         newest = self.outbox.newest
         if newest is not None:
@@ -259,6 +262,7 @@ class VehicleCore:
     def _forget_filter(self) -> None:
         self.filter = FramedFilter(self.filter.settings, self.filter.model)
         self.steps, self.time_s, self.healthy = 0, -math.inf, True
+        self._given = []
         self._kept += [Delete(table, records.after(table)) for table in (records.READING, records.STATE)]
 
     @property
@@ -271,12 +275,20 @@ class VehicleCore:
         """Live estimates of the landmarks in the world, m, shape (n, 2), by number."""
         return act_all(self.identity.start_pose, self.filter.landmarks)
 
+    @property
+    def assigned(self) -> Ints:
+        """The number of the landmark that each sighting given so far is of, -1 none (of a refused reading), (S,)."""
+        numbers = {signature: number for number, signature in enumerate(self.filter.signatures)}
+        given = np.concatenate([*self._given, np.empty(0, np.int64)])
+        return np.array([numbers.get(signature, -1) for signature in given.tolist()], np.int64)
+
     def start(self, time_s: float, sightings: Sightings) -> StepResult:
         """Sequence 0: the hello, and what is seen before any motion."""
         self._check(time_s, sightings)
         if self.outbox.last >= 0:
             raise ReadingRefused("this vehicle has already started")
         result, parts = self.filter.start(sightings)
+        self._given.append(np.asarray(sightings.signature, np.int64))
         self._keep(Reading(time_s=time_s, odometry=np.zeros(3), odometry_cov=np.eye(3), sightings=sightings), result)
         self._append(time_s, result, parts, self._hello(None))
         return result
@@ -304,6 +316,7 @@ class VehicleCore:
                 "steps": self.steps,
                 "time_s": reading.time_s,
                 "healthy": self.healthy,
+                "given": np.concatenate(self._given).tobytes(),
             }
             data = msgpack.packb(state)
             self._reading_bytes, self._state_bytes = 0, max(len(data), STATE_BYTES_LEAST)
@@ -321,13 +334,14 @@ class VehicleCore:
         try:
             result, parts = self.filter.step(reading)
         except ReadingRefused:
-            self.counters.readings_refused += 1
+            self._count_refused(reading.sightings)
             raise
         except NumericalError:
-            self.counters.readings_refused += 1
+            self._count_refused(reading.sightings)
             self.healthy = False
             raise
         self.steps += 1
+        self._given.append(np.asarray(reading.sightings.signature, np.int64))
         self._keep(reading, result)
         self._append(reading.time_s, result, parts, None)
         return result
@@ -346,8 +360,12 @@ class VehicleCore:
         elif len(sightings.z) > SIGHTINGS_MAX:
             fault = f"it holds {len(sightings.z)} sightings, at most {SIGHTINGS_MAX} are taken"
         if fault:
-            self.counters.readings_refused += 1
+            self._count_refused(sightings)
             raise ReadingRefused(f"reading refused: {fault}")
+
+    def _count_refused(self, sightings: Sightings) -> None:
+        self.counters.readings_refused += 1
+        self._given.append(np.full(len(sightings.z), UNKNOWN_SIGNATURE))
 
     def _append(self, time_s: float, result: StepResult, parts: tuple[FramePart, ...], hello: Hello | None) -> None:
         self.time_s = time_s

@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from vehicles.vehicle import Vehicle
 
 log = logging.getLogger(__name__)
 SILENCE_S = 30.0
+NOT_KNOWN: Final = -2
+"""Assignment of a sighting of which the vehicle cannot tell any more what it took it for."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -21,6 +24,8 @@ class DriveResult:
     """What a vehicle has to say after its run.
 
     pose (T+1, 3): live estimate after each step. landmarks (n, 2), signatures (n,): its own live map at the end.
+    assigned (S,): for each sighting that it was given, those of pose 0 first, the number of the landmark that it is of
+    as far as the vehicle knows at the end, -1 none; all NOT_KNOWN where it cannot tell, because it was killed.
     filter_s, publish_s (T,): time spent on each step. bytes_put, messages: what it published.
     readings_refused, sightings_refused: what its filter would not take. steps_beyond_active_max: after which more
     landmarks were linked to the pose than the bound allows.
@@ -29,6 +34,7 @@ class DriveResult:
     pose: Floats
     landmarks: Floats
     signatures: Ints
+    assigned: Ints
     filter_s: Floats
     publish_s: Floats
     bytes_put: int
@@ -41,7 +47,8 @@ class DriveResult:
 class Notes:
     """Collects a DriveResult step by step; steps that another process has taken stay NaN."""
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, sightings: int) -> None:
+        self._sightings = sightings
         self.pose = np.full((steps + 1, 3), np.nan)
         self.filter_s: list[float] = []
         self.publish_s: list[float] = []
@@ -52,12 +59,16 @@ class Notes:
         if filter_s is not None:
             self.filter_s.append(filter_s)
 
-    def result(self, landmarks: Floats, signatures: list[int], counters: Counters) -> DriveResult:
+    def result(self, landmarks: Floats, signatures: list[int], assigned: Ints, counters: Counters) -> DriveResult:
         """All of it, with what the vehicle counted."""
+        if len(assigned) != self._sightings:
+            log.warning("assignments_not_known told=%d sightings=%d", len(assigned), self._sightings)
+            assigned = np.full(self._sightings, NOT_KNOWN)
         return DriveResult(
             pose=self.pose,
             landmarks=landmarks,
             signatures=np.array(signatures, np.int64),
+            assigned=assigned,
             filter_s=np.array(self.filter_s),
             publish_s=np.array(self.publish_s),
             bytes_put=counters.bytes_put,
@@ -83,7 +94,7 @@ def drive(
 
     Raises RunError where nothing is acknowledged for SILENCE_S.
     """
-    notes = Notes(len(readings))
+    notes = Notes(len(readings), sum(len(seen.z) for seen in (first, *(each.sightings for each in readings))))
     if not vehicle.started:
         vehicle.start(first, time_s=start_s)
         notes.take(0, vehicle.pose)
@@ -111,7 +122,7 @@ def drive(
         if vehicle.acknowledged == acknowledged:
             raise _silence()
         acknowledged = vehicle.acknowledged
-    return notes.result(vehicle.landmarks, vehicle.signatures, vehicle.counters)
+    return notes.result(vehicle.landmarks, vehicle.signatures, vehicle.assigned, vehicle.counters)
 
 
 def _silence() -> RunError:

@@ -27,7 +27,7 @@ from fleet_seif.filters import StepResult
 from fleet_seif.keys import Keys
 from fleet_seif.messages import Epoch
 from fleet_seif.models import RANGE_BEARING
-from fleet_seif.records import Floats, Reading, Sightings
+from fleet_seif.records import Floats, Ints, Reading, Sightings
 from fleet_seif.signing import KeyRing, Signer
 from fleet_seif.sqlite_store import SqliteStore
 from fleet_seif.store import Store
@@ -333,6 +333,12 @@ class Vehicle:
         """The signature of each landmark, in the same order."""
         with self._lock:
             return list(self._core.filter.signatures)
+
+    @property
+    def assigned(self) -> Ints:
+        """The number of the landmark that each sighting given so far is of, -1 none, shape (S,)."""
+        with self._lock:
+            return self._core.assigned
 
     @property
     def acknowledged(self) -> int:

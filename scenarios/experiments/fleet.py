@@ -10,8 +10,7 @@ from scenarios.config import load_scenario
 from scenarios.experiments.study import Cell, Progress, Row, csv_of, png_of, write_csv
 from scenarios.figure import draw_figure, figure_times
 from scenarios.history import Moment, replay
-from scenarios.recording import Recording
-from scenarios.report import Outcome, evaluate
+from scenarios.report import FinishedRun, Outcome, evaluate
 from scenarios.score import score_map
 from scenarios.source import record
 from scenarios.virtual import run_virtual
@@ -38,13 +37,21 @@ def run(out: Path, seed: int, quick: bool, progress: Progress) -> list[Row]:
     times = figure_times("meetings", recording)
     moments = list(replay(finished.ledger, times.times_s))
     tracks = {name: drive.pose for name, drive in finished.drives.items()}
-    draw_figure(png_of(out, NAME), title=TITLE, recording=recording, times=times, moments=moments, tracks=tracks)
-    write_csv(csv_of(out, NAME), [_line(moment, recording) for moment in moments])
+    draw_figure(
+        png_of(out, NAME),
+        title=TITLE,
+        recording=recording,
+        times=times,
+        moments=moments,
+        tracks=tracks,
+        truths=finished.truths,
+    )
+    write_csv(csv_of(out, NAME), [_line(moment, finished) for moment in moments])
     return _rows(evaluate(finished))
 
 
-def _line(moment: Moment, recording: Recording) -> dict[str, Cell]:
-    score = score_map(moment.solution, moment.landmark_cov, recording)
+def _line(moment: Moment, run: FinishedRun) -> dict[str, Cell]:
+    score = score_map(moment.solution, moment.landmark_cov, run.recording, run.truths)
     return {
         "time_s": moment.time_s,
         "landmarks": score.fused_landmarks,

@@ -26,7 +26,7 @@ MILD_NOISE: Final = NoiseSettings(forward_std_m=0.005, turn_std_rad=0.03, range_
 PAPER_WORLD, MILD_WORLD, COMPASS = "the paper's noise", "mild noise", "compass"
 """Names of worlds; the last is linear."""
 COMPASS_STREAM: Final = 3
-"""Random numbers of the compass world; `scenarios.world` uses 0 to 2."""
+"""Random numbers of the compass world; `scenarios.world` and `scenarios.detection` use the others up to 9."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
