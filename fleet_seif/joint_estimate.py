@@ -60,7 +60,7 @@ NEAR_ENOUGH: Final = 1e-4
 
 
 class Estimate:
-    """See the rules above. X (v, 3): the state by joint variable."""
+    """See the rules above. X (v, 3): the state by joint variable. last: the evaluation where it settled last."""
 
     def __init__(self, registry: Registry) -> None:
         self.registry = registry
@@ -74,7 +74,7 @@ class Estimate:
         self._weight = np.zeros(0)
         self._spans = np.empty((0, 2), np.int64)
         self._generation = 0
-        self._last: Evaluation | None = None
+        self.last: Evaluation | None = None
 
     @property
     def frames(self) -> Frames:
@@ -193,7 +193,7 @@ class Estimate:
             if then.cost <= now.cost * (1.0 + SLACK) + SLACK or short:
                 self.X, now = then.X, then
                 if short:
-                    self._last = now
+                    self.last = now
                     return True, now
                 self.damping = self.damping / DAMPING_FACTOR if self.damping > DAMPING_FIRST else 0.0
                 if length > SLOW * last:
@@ -206,6 +206,15 @@ class Estimate:
                 if self.damping > DAMPING_MAX:
                     break
         return False, now
+
+    def covariance(self, variables: Ints) -> Floats:
+        """Joint block of H^-1 of these variables, frames linearised where they were last; see Tree.covariance.
+
+        Raises NumericalError where the joint information matrix is not positive definite.
+        """
+        assert self.last is not None
+        self.tree.factor(self.frames, self.last)
+        return self.tree.covariance(variables)
 
     def settle_near(self, changed: Sequence[int], disagreement: float) -> Evaluation | None:
         """Improve what each of these frames is about, one after the other, all else held.
@@ -221,12 +230,12 @@ class Estimate:
             if held.chi_square[f] > disagreement * self.frames.limit[f]:
                 return None
             now = held
-        self._last = now
+        self.last = now
         return now
 
     def _remembered(self) -> Evaluation | None:
         """The last evaluation, with room for the frames and variables that have come since; None before the first."""
-        last = self._last
+        last = self.last
         if last is None:
             return None
         chi_square, weight = np.zeros(len(self.frames.start)), np.ones(len(self.frames.start))

@@ -23,7 +23,7 @@ from fleet_seif.joint_estimate import Estimate
 from fleet_seif.joint_records import Classes, JointSolution, Life, System
 from fleet_seif.joint_registry import Change, Records, Registry
 from fleet_seif.messages import LandmarkName
-from fleet_seif.records import Ints
+from fleet_seif.records import Floats, Ints
 
 ITERATIONS_MAX: Final = 400
 """Frames that contradict each other strongly make the last steps shrink slowly."""
@@ -94,6 +94,20 @@ class JointSolver:
             except NumericalError:  # replayed below, which raises it again if it is not for the start
                 pass
         return self.replay(lives, classes)
+
+    @one_thread
+    def joint_covariance(self, solution: JointSolution, landmarks: Ints, poses: Ints) -> Floats:
+        """Exact joint covariance of some rows of the last solution: poses, then landmarks, shape (3 p + 2 k, 3 p + 2 k).
+
+        Linearised where its frames were last, robust weights included.
+
+        Args:
+            landmarks (k,): positions in its `classes`. poses (p,): in its `poses`. Each once.
+        """
+        estimate, variable, count = self._estimate, solution.system.variable, len(solution.classes)
+        if estimate is None or solution.system.at is not estimate.last:
+            raise ValueError("joint_covariance is of the last solution only: solve again")
+        return estimate.covariance(np.concatenate([variable[count + poses], variable[landmarks]]))
 
     def _settled(self, estimate: Estimate) -> Evaluation | None:
         """All of it."""

@@ -419,6 +419,39 @@ class Tree:
             _backward_into(x, node.D, node.W, node.rows)
         return x.reshape(-1, 3)
 
+    def covariance(self, variables: Ints) -> Floats:
+        """The joint block of H^-1 of these variables (each once, ascending rows of one after the other's), (n, n).
+
+        E' H^-1 E = Y'Y with Y = L^-1 E: only nodes between a variable's own and the root take part.
+        """
+        sizes = self.size[variables]
+        ends = np.cumsum(sizes)
+        column = dict(zip(variables.tolist(), (ends - sizes).tolist(), strict=True))
+        g: dict[Node, Floats] = {}
+        for v in variables.tolist():
+            node = self._home[v]
+            while node is not None and node not in g:
+                g[node] = np.zeros((len(node.rows), int(ends[-1])))
+                node = node.parent
+        total = np.zeros((int(ends[-1]), int(ends[-1])))
+        for node in self.nodes():
+            if node not in g:
+                continue
+            whole = g.pop(node)
+            at = 0
+            for v in node.variables[: node.eliminated].tolist():
+                if v in column:
+                    for a in range(self.size[v]):
+                        whole[at + a, column[v] + a] = 1.0
+                at += int(self.size[v])
+            if at:
+                y = scipy.linalg.solve_triangular(node.D, whole[:at], trans=1, check_finite=False)
+                total += y.T @ y
+                whole[at:] -= node.W.T @ y
+            if node.parent is not None:
+                g[node.parent][node.place] += whole[at:]
+        return (total + total.T) / 2
+
     def inverse_blocks(self) -> Floats:
         """The block of H^-1 of every variable, shape (v, 3, 3): selected inversion (Takahashi), from the root down.
 

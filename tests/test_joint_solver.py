@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -192,6 +192,28 @@ def test_a_tree_with_any_history_is_the_factor_of_the_dense_matrix(
             assert np.all(np.abs(found[v, : tree.size[v]] - x[k]) <= 1e-6 * scale[k])
             error = blocks[v, : tree.size[v], : tree.size[v]] - P[k, k]
             assert np.all(np.abs(error) <= 1e-7 * np.outer(scale[k], scale[k]))
+
+
+@given(moments(), st.data())
+@settings(settled, max_examples=15)
+def test_a_joint_covariance_is_a_block_of_the_dense_inverse(
+    moment: tuple[list[Life], Classes], data: st.DataObject
+) -> None:
+    lives, classes = moment
+    if not any(life.frames for life in lives):
+        return
+    solver = JointSolver()
+    solution = solver.replay(lives, classes)
+    count, some = len(classes), partial(st.lists, max_size=5, unique=True)
+    landmarks = np.array(data.draw(some(st.integers(0, count - 1))), np.int64)
+    poses = np.array(data.draw(some(st.integers(0, len(solution.poses) - 1))), np.int64)
+    if not len(landmarks) + len(poses):
+        return
+    found = solver.joint_covariance(solution, landmarks, poses)
+    rows = [2 * count + 3 * p + a for p in poses for a in range(3)] + [2 * j + a for j in landmarks for a in range(2)]
+    P = np.linalg.inv(solution.H.toarray())[np.ix_(rows, rows)]
+    scale = np.sqrt(np.diag(P))
+    assert np.all(np.abs(found - P) <= 0.05 * np.outer(scale, scale))  # frames are linearised where they were last
 
 
 def test_only_the_nodes_above_a_frame_that_was_linearised_anew_are_redone() -> None:

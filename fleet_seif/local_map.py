@@ -1,0 +1,206 @@
+"""Where a vehicle is and what lies around it, as one dense Gaussian in the coordinates of the open frame.
+
+1. It begins as the landmarks near the frame's start, as the vehicle's own map of closed frames knows them, with their
+   joint covariance; the pose is (0, 0, 0) there, exactly. Then it is a textbook EKF over pose and landmarks.
+2. It serves to tell which landmark a sighting belongs to, and nothing of it is published: the frame's filter takes the
+   readings alone (DESIGN D4, D5).
+3. Its size is bounded, whatever the size of the map.
+4. Every function returns a new map: a step that is refused in the end has changed nothing.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleet_seif.dense import inverse_2x2
+from fleet_seif.geometry import wrap
+from fleet_seif.jit import kernel
+from fleet_seif.models import heading_column, innovation_numbers, move, place, sight_numbers
+from fleet_seif.records import Floats, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class LocalMap:
+    """mean (3 + 2 k,): pose, then landmarks, m and rad. P (3 + 2 k, 3 + 2 k): its covariance. keys (k,): theirs."""
+
+    mean: Floats
+    P: Floats
+    keys: Ints
+
+    @property
+    def landmarks(self) -> Floats:
+        """Shape (k, 2), m."""
+        return self.mean[3:].reshape(-1, 2)
+
+    @property
+    def pose(self) -> Floats:
+        """Shape (3,)."""
+        return self.mean[:3]
+
+
+def nothing_known() -> LocalMap:
+    """A frame's start, without a landmark."""
+    return LocalMap(np.zeros(3), np.zeros((3, 3)), np.empty(0, np.int64))
+
+
+@kernel
+def _blocks(model: int, mean: Floats, which: Ints) -> tuple[Floats, Floats, Floats]:
+    """Expected sightings h (c, 2) of these landmarks, and their Jacobians J_z_x (c, 2, 3), J_z_y (c, 2, 2)."""
+    h, J_x, J_y = np.empty((len(which), 2)), np.zeros((len(which), 2, 3)), np.empty((len(which), 2, 2))
+    for i in range(len(which)):
+        a = 3 + 2 * which[i]
+        h0, h1, x00, x01, y00, y01, x10, x11, y10, y11 = sight_numbers(model, mean[:3], mean[a], mean[a + 1])
+        h[i, 0], h[i, 1] = h0, h1
+        J_x[i, 0, 0], J_x[i, 0, 1], J_x[i, 1, 0], J_x[i, 1, 1] = x00, x01, x10, x11
+        J_x[i, 1, 2] = heading_column(model)
+        J_y[i, 0, 0], J_y[i, 0, 1], J_y[i, 1, 0], J_y[i, 1, 1] = y00, y01, y10, y11
+    return h, J_x, J_y
+
+
+@kernel
+def _spread(P: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
+    """P J' for sightings of these landmarks, shape (n, 2 c)."""
+    n, out = len(P), np.empty((len(P), 2 * len(which)))
+    for i in range(len(which)):
+        a = 3 + 2 * which[i]
+        for r in range(n):
+            for k in range(2):
+                out[r, 2 * i + k] = (
+                    P[r, 0] * J_x[i, k, 0] + P[r, 1] * J_x[i, k, 1] + P[r, 2] * J_x[i, k, 2]
+                    + P[r, a] * J_y[i, k, 0] + P[r, a + 1] * J_y[i, k, 1]
+                )  # fmt: skip
+    return out
+
+
+@kernel
+def _seen(spread: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
+    """J (P J') for the same sightings, shape (2 c, 2 c)."""
+    m, out = 2 * len(which), np.empty((2 * len(which), 2 * len(which)))
+    for i in range(len(which)):
+        a = 3 + 2 * which[i]
+        for k in range(2):
+            for c in range(m):
+                out[2 * i + k, c] = (
+                    J_x[i, k, 0] * spread[0, c] + J_x[i, k, 1] * spread[1, c] + J_x[i, k, 2] * spread[2, c]
+                    + J_y[i, k, 0] * spread[a, c] + J_y[i, k, 1] * spread[a + 1, c]
+                )  # fmt: skip
+    return (out + out.T) / 2
+
+
+@kernel
+def expected(model: int, mean: Floats, P: Floats, which: Ints) -> tuple[Floats, Floats]:
+    """What is expected of these landmarks: h (c, 2), and the joint covariance J P J' (2 c, 2 c) without sensor noise."""
+    h, J_x, J_y = _blocks(model, mean, which)
+    return h, _seen(_spread(P, which, J_x, J_y), which, J_x, J_y)
+
+
+@kernel
+def in_reach(mean: Floats, P: Floats, reach: float, sigmas: float) -> Ints:
+    """Landmarks that may be nearer than `reach`, given so many standard deviations of where they are from the pose."""
+    count, found = 0, np.empty((len(mean) - 3) // 2, np.int64)
+    for i in range(len(found)):
+        a = 3 + 2 * i
+        dx, dy = mean[a] - mean[0], mean[a + 1] - mean[1]
+        variance = 0.0
+        for k in range(2):
+            variance += P[a + k, a + k] + P[k, k] - 2.0 * P[a + k, k]
+        most = reach + sigmas * np.sqrt(max(variance, 0.0))
+        if dx * dx + dy * dy <= most * most:
+            found[count] = i
+            count += 1
+    return found[:count]
+
+
+def moved(model: int, local: LocalMap, u: Floats, cov: Floats) -> LocalMap:
+    """After odometry u (3,) with covariance cov (3, 3)."""
+    pose, J_x, J_u = move(model, local.pose, u)
+    mean, P = local.mean.copy(), local.P.copy()
+    mean[:3] = pose
+    P[:3] = J_x @ P[:3]
+    P[:, :3] = P[:, :3] @ J_x.T
+    P[:3, :3] += J_u @ cov @ J_u.T
+    return replace(local, mean=mean, P=P)
+
+
+@kernel
+def _innovations(model: int, z: Floats, h: Floats) -> Floats:
+    r = np.empty(2 * len(z))
+    for i in range(len(z)):
+        r[2 * i], r[2 * i + 1] = innovation_numbers(model, z[i, 0], z[i, 1], h[i, 0], h[i, 1])
+    return r
+
+
+def sighted(model: int, local: LocalMap, which: Ints, z: Floats, Z: Floats) -> tuple[LocalMap, float]:
+    """After sightings of these landmarks, all at once; and the squared normalised innovation r' S^-1 r.
+
+    S = J P J' + Z        mean' = mean + P J' S^-1 r        P' = P - P J' S^-1 J P
+
+    Args:
+        which (m,): positions in the map. z (m, 2), Z (m, 2, 2).
+    """
+    if not len(which):
+        return local, 0.0
+    h, J_x, J_y = _blocks(model, local.mean, which)
+    spread = _spread(local.P, which, J_x, J_y)
+    S, r = _seen(spread, which, J_x, J_y), _innovations(model, z, h)
+    for i in range(len(which)):
+        S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += Z[i]
+    L = np.linalg.cholesky(S)
+    half = np.linalg.solve(L, np.column_stack([spread.T, r]))
+    gain, w = half[:, :-1], half[:, -1]
+    P = local.P - gain.T @ gain
+    return replace(local, mean=local.mean + gain.T @ w, P=(P + P.T) / 2), float(w @ w)
+
+
+def with_new(model: int, local: LocalMap, key: int, z: Floats, Z: Floats) -> LocalMap:
+    """With one more landmark, where a sighting puts it: y = f(x, z), P_yy = G_x P_xx G_x' + G_z Z G_z'."""
+    n = len(local.mean)
+    y = place(model, local.pose, z)
+    _, J_x, J_y = _blocks(model, np.concatenate([local.pose, y]), np.zeros(1, np.int64))
+    G_z = inverse_2x2(J_y[0])
+    G_x = -G_z @ J_x[0]
+    P = np.empty((n + 2, n + 2))
+    P[:n, :n] = local.P
+    P[n:, :n] = G_x @ local.P[:3]
+    P[:n, n:] = P[n:, :n].T
+    P[n:, n:] = G_x @ local.P[:3, :3] @ G_x.T + G_z @ Z @ G_z.T
+    return LocalMap(np.concatenate([local.mean, y]), P, np.append(local.keys, key))
+
+
+def kept(local: LocalMap, which: Ints) -> LocalMap:
+    """Only these landmarks."""
+    rows = np.concatenate([np.arange(3), (3 + 2 * which[:, None] + np.arange(2)).ravel()])
+    return LocalMap(local.mean[rows], local.P[np.ix_(rows, rows)], local.keys[which])
+
+
+def renamed(local: LocalMap, key: int, new: int) -> LocalMap:
+    """One landmark under another key."""
+    return replace(local, keys=np.where(local.keys == key, new, local.keys))
+
+
+def seen_from(start: Floats, landmarks: Floats, P: Floats, keys: Ints) -> LocalMap:
+    """Landmarks (k, 2) in the world, as seen from the pose `start` (3,) that becomes the origin.
+
+    y' = R'(y - t):   J_y'_t = -R'   J_y'_theta = (y'_y, -y'_x)   J_y'_y = R'
+
+    Args:
+        P: joint covariance of `start` and the landmarks, shape (3 + 2 k, 3 + 2 k).
+    """
+    c, s = np.cos(start[2]), np.sin(start[2])
+    R_T = np.array([[c, s], [-s, c]])
+    y = (landmarks - start[:2]) @ R_T.T
+    k = len(y)
+    J = np.zeros((2 * k, 3 + 2 * k))
+    for i in range(k):
+        J[2 * i : 2 * i + 2, :2] = -R_T
+        J[2 * i : 2 * i + 2, 2] = y[i, 1], -y[i, 0]
+        J[2 * i : 2 * i + 2, 3 + 2 * i : 5 + 2 * i] = R_T
+    whole = np.zeros((3 + 2 * k, 3 + 2 * k))
+    whole[3:, 3:] = J @ P @ J.T
+    return LocalMap(np.concatenate([np.zeros(3), y.ravel()]), (whole + whole.T) / 2, keys)
+
+
+def begun_at(local: LocalMap) -> LocalMap:
+    """The map as seen from its pose, which becomes the origin: for landmarks that the next frame goes on with."""
+    pose, landmarks = local.pose, local.landmarks
+    return seen_from(np.array([*pose[:2], wrap(pose[2])]), landmarks, local.P, local.keys)
