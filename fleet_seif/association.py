@@ -14,7 +14,7 @@ from scipy.special import gammaincinv
 from fleet_seif.association_guards import PAIRED, Limits, leave_one_out, margins, verdicts
 from fleet_seif.config import AssociationSettings
 from fleet_seif.errors import NumericalError
-from fleet_seif.jcbb import UNPAIRED, Problem, insert_sorted, pair_cost, problem, search
+from fleet_seif.jcbb import UNPAIRED, Problem, insert_sorted, is_sound, pair_cost, problem, search
 from fleet_seif.jit import kernel
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Ints
@@ -57,15 +57,15 @@ def nearest_neighbour(p: Problem, at: Limits) -> tuple[Ints, bool]:
     m, n = p.d2.shape
     assignment, owner = np.full(m, UNPAIRED), np.full(n, -1)
     for i in range(m):
-        j = np.argmin(p.d2[i]) if n > 0 else 0
-        if n == 0 or not p.d2[i, j] <= at.gate:
+        nearest, least = UNPAIRED, np.inf
+        for j in range(n):
+            if p.d2[i, j] <= at.gate and p.d2[i, j] < least:
+                nearest, least = j, p.d2[i, j]
+        if nearest == UNPAIRED or (owner[nearest] >= 0 and p.d2[owner[nearest], nearest] <= least):
             continue
-        other = owner[j]
-        if other >= 0 and p.d2[other, j] <= p.d2[i, j]:
-            continue
-        if other >= 0:
-            assignment[other] = UNPAIRED
-        owner[j], assignment[i] = i, j
+        if owner[nearest] >= 0:
+            assignment[owner[nearest]] = UNPAIRED
+        owner[nearest], assignment[i] = i, nearest
     return assignment, False
 
 
@@ -99,10 +99,12 @@ def joint_compatibility(p: Problem, at: Limits) -> tuple[Ints, bool]:
 
 
 @kernel
-def decide(model: int, method: int, z: Floats, Z: Floats, h: Floats, C: Floats, at: Limits) -> tuple[bool, Association]:
-    """`associate` on arrays; its input is sound, or what is returned means nothing."""
+def decide(
+    model: int, method: int, z: Floats, Z: Floats, h: Floats, C: Floats, at: Limits
+) -> tuple[bool, Ints, Ints, Ints, Floats, float, int, bool]:
+    """`associate` on arrays: whether its input is sound, then the fields of Association."""
     p = problem(model, z, Z, h, C)
-    sound = bool(np.all(np.isfinite(p.log_det_Z)) and np.all(np.isfinite(p.d2)))
+    sound = is_sound(p)
     if not sound or method == NEAREST_NEIGHBOUR:
         hypothesis, cut_short = nearest_neighbour(p, at)
     elif method == MAXIMUM_LIKELIHOOD:
@@ -112,9 +114,11 @@ def decide(model: int, method: int, z: Floats, Z: Floats, h: Floats, C: Floats, 
     known = leave_one_out(p, hypothesis)
     margin = margins(p, hypothesis, known, at)
     verdict = verdicts(p, hypothesis, margin, at)
-    assignment = np.where(verdict == PAIRED, hypothesis, UNPAIRED)
-    pairs = len(known.sightings)
-    return sound, Association(assignment, verdict, hypothesis, margin, known.d2, pairs, cut_short)
+    assignment = hypothesis.copy()
+    for i in range(len(z)):
+        if verdict[i] != PAIRED:
+            assignment[i] = UNPAIRED
+    return sound, assignment, verdict, hypothesis, margin, known.d2, len(known.sightings), cut_short
 
 
 @functools.lru_cache(maxsize=256)
@@ -155,10 +159,12 @@ def associate(
             f"z {z.shape}, Z {Z.shape}, h {h.shape}, C {C.shape} do not go together: give m sightings (m, 2), "
             "(m, 2, 2) and n candidates (n, 2), (2n, 2n)"
         )
-    sound, found = decide(model, METHODS.index(settings.method), z, Z, h, C, limits(settings, m))
+    sound, assignment, verdict, hypothesis, margin, squared_innovation, pairs, cut_short = decide(
+        model, METHODS.index(settings.method), z, Z, h, C, limits(settings, m)
+    )
     if not sound:
         raise NumericalError(
             "sightings cannot be associated: a number is not finite, or a covariance not positive definite; "
             "check the reading and the filter's covariance"
         )
-    return found
+    return Association(assignment, verdict, hypothesis, margin, squared_innovation, pairs, cut_short)

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fleet_seif.dense import cholesky_into, inverse_2x2, solve_lower_into, solve_upper_into
+from fleet_seif.dense import cholesky_into, solve_lower_into, solve_upper_into
 from fleet_seif.jcbb import Problem, normal_cost
 from fleet_seif.jit import kernel
 from fleet_seif.records import Floats, Ints
@@ -66,11 +66,15 @@ class Known(NamedTuple):
 @kernel
 def leave_one_out(p: Problem, hypothesis: Ints) -> Known:
     """What is needed to look at each sighting given all others; hypothesis (m,): candidate or -1."""
-    sightings = np.nonzero(hypothesis >= 0)[0]
-    candidates, k = hypothesis[sightings], len(sightings)
+    sightings, candidates, k = np.empty(len(hypothesis), np.int64), np.empty(len(hypothesis), np.int64), 0
+    for i in range(len(hypothesis)):
+        if hypothesis[i] >= 0:
+            sightings[k], candidates[k] = i, hypothesis[i]
+            k += 1
+    sightings, candidates = sightings[:k], candidates[:k]
     S, L, A, q = np.empty((2 * k, 2 * k)), np.empty((2 * k, 2 * k)), np.eye(2 * k), np.empty(2 * k)
     for a in range(k):
-        q[2 * a], q[2 * a + 1] = p.r[sightings[a], candidates[a]]
+        q[2 * a], q[2 * a + 1] = p.r[sightings[a], candidates[a], 0], p.r[sightings[a], candidates[a], 1]
         for b in range(k):
             for row in range(2):
                 for column in range(2):
@@ -78,8 +82,7 @@ def leave_one_out(p: Problem, hypothesis: Ints) -> Known:
         for row in range(2):
             for column in range(2):
                 S[2 * a + row, 2 * a + column] += p.Z[sightings[a], row, column]
-    if not cholesky_into(L, S, 2 * k):
-        A[:] = np.nan
+    cholesky_into(L, S, 2 * k)
     for row in range(2 * k):
         solve_lower_into(A[row], L, 2 * k)
         solve_upper_into(A[row], L, 2 * k)
@@ -99,57 +102,80 @@ def prediction_given(p: Problem, known: Known, u: Floats, j: int) -> tuple[float
     u (2, 2k): is overwritten with c A.
     """
     k = 2 * len(known.candidates)
-    e = np.zeros(2)
-    K = p.C[2 * j : 2 * j + 2, 2 * j : 2 * j + 2].copy()
-    for row in range(2):
+    e0, e1 = 0.0, 0.0
+    k00, k10, k11 = p.C[2 * j, 2 * j], p.C[2 * j + 1, 2 * j], p.C[2 * j + 1, 2 * j + 1]
+    for a in range(k):
+        u[0, a], u[1, a] = 0.0, 0.0
+    for b in range(k):
+        column = 2 * known.candidates[b // 2] + b % 2
+        c0, c1 = p.C[2 * j, column], p.C[2 * j + 1, column]
+        e0 += c0 * known.q[b]
+        e1 += c1 * known.q[b]
         for a in range(k):
-            u[row, a] = 0.0
-            for b in range(k):
-                u[row, a] += p.C[2 * j + row, 2 * known.candidates[b // 2] + b % 2] * known.A[b, a]
-        for b in range(k):
-            column = 2 * known.candidates[b // 2] + b % 2
-            e[row] += p.C[2 * j + row, column] * known.q[b]
-            K[row, 0] -= u[row, b] * p.C[2 * j, column]
-            K[row, 1] -= u[row, b] * p.C[2 * j + 1, column]
-    return e[0], e[1], K[0, 0], K[1, 0], K[1, 1]
+            u[0, a] += c0 * known.A[b, a]
+            u[1, a] += c1 * known.A[b, a]
+    for b in range(k):
+        column = 2 * known.candidates[b // 2] + b % 2
+        k00 -= u[0, b] * p.C[2 * j, column]
+        k10 -= u[1, b] * p.C[2 * j, column]
+        k11 -= u[1, b] * p.C[2 * j + 1, column]
+    return e0, e1, k00, k10, k11
+
+
+@kernel
+def swap_cost(
+    p: Problem, known: Known, u: Floats, given: tuple[float, float, float, float, float], i: int, j: int, pair: int
+) -> float:
+    """By how much the joint cost grows when sighting i, pair number `pair`, takes the free candidate j instead.
+
+    given, u: of j, from `prediction_given`.
+    """
+    a, b = 2 * pair, 2 * pair + 1
+    det = known.A[a, a] * known.A[b, b] - known.A[b, a] * known.A[b, a]
+    t00, t10, t11 = known.A[b, b] / det, -known.A[b, a] / det, known.A[a, a] / det
+    q0, q1 = known.q[a], known.q[b]
+    e0, e1, k00, k10, k11 = given
+    x00, x01 = u[0, a] * t00 + u[0, b] * t10, u[0, a] * t10 + u[0, b] * t11
+    x10, x11 = u[1, a] * t00 + u[1, b] * t10, u[1, a] * t10 + u[1, b] * t11
+    k00 += x00 * u[0, a] + x01 * u[0, b] + p.Z[i, 0, 0]
+    k10 += x10 * u[0, a] + x11 * u[0, b] + p.Z[i, 1, 0]
+    k11 += x10 * u[1, a] + x11 * u[1, b] + p.Z[i, 1, 1]
+    e0, e1 = e0 - x00 * q0 - x01 * q1, e1 - x10 * q0 - x11 * q1
+    _, rival = normal_cost(k00, k10, k11, p.r[i, j, 0] - e0, p.r[i, j, 1] - e1)
+    _, now = normal_cost(t00, t10, t11, t00 * q0 + t10 * q1, t10 * q0 + t11 * q1)
+    return rival - now
 
 
 @kernel
 def margins(p: Problem, hypothesis: Ints, known: Known, at: Limits) -> Floats:
     """By how much the joint cost grows when one sighting alone changes to the best candidate that is free, (m,).
 
-    Rivals are within the birth gate of the sighting. Infinite where it has none; at least 0 where the hypothesis is
-    the best of those whose pairs pass that gate.
+    Rivals are within the birth gate of the sighting. Infinite where it has none; negative where a rival that the
+    method may not take would be better.
     """
     m, n = p.d2.shape
-    k = len(known.sightings)
-    margin, u, free, place = np.full(m, np.inf), np.empty((2, 2 * k)), np.ones(n, np.int64), np.full(m, -1)
-    for a in range(k):
-        free[known.candidates[a]], place[known.sightings[a]] = 0, a
-    for j in range(n if m > 0 else 0):
-        if free[j] == 0 or not np.min(p.d2[:, j]) <= at.birth_gate:
-            continue
-        e0, e1, k00, k10, k11 = prediction_given(p, known, u, j)
+    margin, free, pair = np.full(m, np.inf), np.ones(n, np.int64), np.full(m, -1)
+    u = np.empty((2, len(known.q)))
+    for a in range(len(known.sightings)):
+        free[known.candidates[a]], pair[known.sightings[a]] = 0, a
+    for j in range(n):
+        near = 0
         for i in range(m):
-            if not p.d2[i, j] <= at.birth_gate:
-                continue
-            t00, t10, t11 = k00 + p.Z[i, 0, 0], k10 + p.Z[i, 1, 0], k11 + p.Z[i, 1, 1]
-            v0, v1, now = p.r[i, j, 0] - e0, p.r[i, j, 1] - e1, at.cost_unpaired
-            if hypothesis[i] >= 0:
-                a = 2 * place[i]
-                T = inverse_2x2(known.A[a : a + 2, a : a + 2])
-                q0, q1 = known.q[a], known.q[a + 1]
-                x00, x01 = u[0, a] * T[0, 0] + u[0, a + 1] * T[1, 0], u[0, a] * T[0, 1] + u[0, a + 1] * T[1, 1]
-                x10, x11 = u[1, a] * T[0, 0] + u[1, a + 1] * T[1, 0], u[1, a] * T[0, 1] + u[1, a + 1] * T[1, 1]
-                t00 += x00 * u[0, a] + x01 * u[0, a + 1]
-                t10 += x10 * u[0, a] + x11 * u[0, a + 1]
-                t11 += x10 * u[1, a] + x11 * u[1, a + 1]
-                v0 += x00 * q0 + x01 * q1
-                v1 += x10 * q0 + x11 * q1
-                now_0, now_1 = T[0, 0] * q0 + T[0, 1] * q1, T[1, 0] * q0 + T[1, 1] * q1
-                now = normal_cost(T[0, 0], T[1, 0], T[1, 1], now_0, now_1)[1] - p.log_det_Z[i]
-            rival = normal_cost(t00, t10, t11, v0, v1)[1] - p.log_det_Z[i]
-            margin[i] = min(margin[i], rival - now)
+            near += p.d2[i, j] <= at.birth_gate
+        if free[j] == 0 or near == 0:
+            continue
+        given = prediction_given(p, known, u, j)
+        for i in range(m):
+            if p.d2[i, j] <= at.birth_gate:
+                if pair[i] >= 0:
+                    more = swap_cost(p, known, u, given, i, j, pair[i])
+                else:
+                    e0, e1, k00, k10, k11 = given
+                    _, cost = normal_cost(
+                        k00 + p.Z[i, 0, 0], k10 + p.Z[i, 1, 0], k11 + p.Z[i, 1, 1], p.r[i, j, 0] - e0, p.r[i, j, 1] - e1
+                    )
+                    more = cost - p.log_det_Z[i] - at.cost_unpaired
+                margin[i] = min(margin[i], more)
     return margin
 
 

@@ -63,6 +63,19 @@ def problem(model: int, z: Floats, Z: Floats, h: Floats, C: Floats) -> Problem:
 
 
 @kernel
+def is_sound(p: Problem) -> bool:
+    """Whether every pair has a finite innovation with a positive definite covariance, and so has every noise."""
+    m, n = p.d2.shape
+    for i in range(m):
+        if not math.isfinite(p.log_det_Z[i]) or not p.Z[i, 0, 0] > 0.0:
+            return False
+        for j in range(n):
+            if not math.isfinite(p.d2[i, j]):
+                return False
+    return True
+
+
+@kernel
 def normal_cost(t00: float, t10: float, t11: float, v0: float, v1: float) -> tuple[float, float]:
     """v' T^-1 v of a symmetric T, and the same with log det T; infinite where T is not positive definite."""
     det = t00 * t11 - t10 * t10
@@ -104,6 +117,17 @@ class Work(NamedTuple):
 
 
 @kernel
+def places(marked: Ints) -> Ints:
+    """Where `marked` is 1, ascending."""
+    found, count = np.empty(len(marked), np.int64), 0
+    for i in range(len(marked)):
+        if marked[i] == 1:
+            found[count] = i
+            count += 1
+    return found[:count]
+
+
+@kernel
 def workspace(p: Problem, gate: float) -> Work:
     """For a search that begins: nothing is taken, decided or known."""
     m, n = p.d2.shape
@@ -117,7 +141,7 @@ def workspace(p: Problem, gate: float) -> Work:
             if p.d2[i, j] <= gate:
                 compatible[i, j] = open_[i] = some[j] = 1
     return Work(
-        compatible, np.nonzero(some)[0], np.empty((n, 2, 2 * m)), np.zeros((m + 1, n, 2)), K, np.ones(n, np.int64),
+        compatible, places(some), np.empty((n, 2, 2 * m)), np.zeros((m + 1, n, 2)), K, np.ones(n, np.int64),
         open_, np.empty((m, n + 1)), np.empty((m, n + 1), np.int64),
     )  # fmt: skip
 
@@ -237,7 +261,7 @@ def search(
     """
     m = len(p.d2)
     s = workspace(p, gate)
-    levels = np.sum(s.open)
+    levels = len(places(s.open))
     children, following = np.zeros(levels, np.int64), np.zeros(levels, np.int64)
     sighting, chosen = np.full(levels, -1), np.full(levels, UNPAIRED)
     cost, d2, pairs = np.zeros(levels + 1), np.zeros(levels + 1), np.zeros(levels + 1, np.int64)
