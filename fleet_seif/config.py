@@ -9,6 +9,7 @@ from fleet_seif.messages import NAME_MAX
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1)]
+InnerProbability = Annotated[float, Field(gt=0, lt=1)]
 
 
 class Settings(BaseModel):
@@ -63,6 +64,31 @@ class FilterSettings(Settings):
     localise_steps: Annotated[int, Field(ge=1, le=10_000)] = 5
     landmarks_max: Annotated[int, Field(ge=1, le=10_000_000)] = 32_767
     neighbours_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
+
+
+class AssociationSettings(Settings):
+    """How a vehicle decides which landmark a sighting without identity belongs to.
+
+    method: "joint_compatibility", all sightings of a step at once; "maximum_likelihood", the likeliest pair first;
+    "nearest_neighbour", each sighting by itself.
+    gate_probability: chance that a true pair passes the gate on its own innovation (2 degrees of freedom).
+    joint_gate_probability: that the true hypothesis passes the gate on the innovation of all its pairs.
+    cost_unpaired: of leaving a sighting unpaired, in squared sigmas; -2 log of how many sightings of no landmark in the
+    map there are per 2 pi standard deviations of sensor noise in range times bearing.
+    ambiguity_margin: a pair is doubtful where another candidate costs less than this more.
+    birth_gate_probability: chance that a landmark's own sighting is within the gate in which none is born beside it.
+    nodes_max: partial hypotheses looked at after which the best so far is taken.
+
+    The last two, costs and the joint gate are of joint_compatibility; guards are of all methods.
+    """
+
+    method: Literal["nearest_neighbour", "maximum_likelihood", "joint_compatibility"] = "joint_compatibility"
+    gate_probability: InnerProbability = 0.99
+    joint_gate_probability: InnerProbability = 0.99
+    cost_unpaired: Positive = 13.0
+    ambiguity_margin: NotNegative = 5.0
+    birth_gate_probability: InnerProbability = 0.99999
+    nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
 
 
 class PublishSettings(Settings):

@@ -68,12 +68,16 @@ def sight(model: int, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 @kernel
+def innovation_numbers(model: int, z0: float, z1: float, h0: float, h1: float) -> tuple[float, float]:
+    """`innovation` without arrays."""
+    return z0 - h0, wrap(z1 - h1) if model == RANGE_BEARING else z1 - h1
+
+
+@kernel
 def innovation(model: int, z: Floats, h: Floats) -> Floats:
     """r = z - h with bearings wrapped, shape (2,)."""
-    r = z - h
-    if model == RANGE_BEARING:
-        r[1] = wrap(r[1])
-    return r
+    r0, r1 = innovation_numbers(model, z[0], z[1], h[0], h[1])
+    return np.array([r0, r1])
 
 
 @kernel
