@@ -18,6 +18,38 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False, validate_default=True)
 
 
+class AssociationSettings(Settings):
+    """How a vehicle decides which landmark a sighting without identity belongs to.
+
+    method: "joint_compatibility", all sightings of a step at once; "maximum_likelihood", the likeliest pair first;
+    "nearest_neighbour", each sighting by itself.
+    gate_probability: chance that a true pair passes the gate on its own innovation (2 degrees of freedom).
+    joint_gate_probability: that the true hypothesis passes the gate on the innovation of all its pairs.
+    cost_unpaired: of leaving a sighting unpaired, in squared sigmas; -2 log of how many sightings of no landmark in the
+    map there are per 2 pi standard deviations of sensor noise in range times bearing.
+    ambiguity_margin: a pair is doubtful where another candidate costs less than this more.
+    birth_gate_probability: chance that a landmark's own sighting is within the gate in which none is born beside it.
+    nodes_max: partial hypotheses looked at after which the best so far is taken.
+    confirm_sightings, confirm_steps: a new landmark is provisional until it has been sighted so many times within so
+    many steps, the first included; else it is forgotten: clutter, or something that moves.
+    local_landmarks_max: landmarks around the start of a frame that sightings are compared with; where there are more, a
+    frame closes before the vehicle leaves them behind.
+
+    The last two, costs and the joint gate are of joint_compatibility; guards are of all methods.
+    """
+
+    method: Literal["nearest_neighbour", "maximum_likelihood", "joint_compatibility"] = "joint_compatibility"
+    gate_probability: InnerProbability = 0.99
+    joint_gate_probability: InnerProbability = 0.99
+    cost_unpaired: Positive = 13.0
+    ambiguity_margin: NotNegative = 5.0
+    birth_gate_probability: InnerProbability = 0.99999
+    nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
+    confirm_sightings: Annotated[int, Field(ge=1, le=100)] = 3
+    confirm_steps: Annotated[int, Field(ge=1, le=1000)] = 8
+    local_landmarks_max: Annotated[int, Field(ge=10, le=1000)] = 150
+
+
 class FilterSettings(Settings):
     """The filter of one vehicle.
 
@@ -41,6 +73,8 @@ class FilterSettings(Settings):
     close_lag_steps: steps after which the correction of a closed frame is published.
     localise_steps: steps after which a vehicle of several frames solves them as one system, for its live pose and
     map; in between the open frame's filter goes on alone. Enters nothing that is published.
+    identities: "signatures", each sighting says which landmark it is; "associated", the vehicle finds out by where
+    it is, as `association` says, and signatures are not looked at.
     landmarks_max: landmarks of a frame, for which address space is reserved; a frame on the wire takes 32,767.
     neighbours_max: links of a landmark to others; where a step would make more, its sighting is refused. Not for "eif".
     """
@@ -62,33 +96,10 @@ class FilterSettings(Settings):
     frame_huber: Positive | None = None
     close_lag_steps: Annotated[int, Field(ge=1, le=10_000)] = 2
     localise_steps: Annotated[int, Field(ge=1, le=10_000)] = 5
+    identities: Literal["signatures", "associated"] = "signatures"
+    association: AssociationSettings = AssociationSettings()
     landmarks_max: Annotated[int, Field(ge=1, le=10_000_000)] = 32_767
     neighbours_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
-
-
-class AssociationSettings(Settings):
-    """How a vehicle decides which landmark a sighting without identity belongs to.
-
-    method: "joint_compatibility", all sightings of a step at once; "maximum_likelihood", the likeliest pair first;
-    "nearest_neighbour", each sighting by itself.
-    gate_probability: chance that a true pair passes the gate on its own innovation (2 degrees of freedom).
-    joint_gate_probability: that the true hypothesis passes the gate on the innovation of all its pairs.
-    cost_unpaired: of leaving a sighting unpaired, in squared sigmas; -2 log of how many sightings of no landmark in the
-    map there are per 2 pi standard deviations of sensor noise in range times bearing.
-    ambiguity_margin: a pair is doubtful where another candidate costs less than this more.
-    birth_gate_probability: chance that a landmark's own sighting is within the gate in which none is born beside it.
-    nodes_max: partial hypotheses looked at after which the best so far is taken.
-
-    The last two, costs and the joint gate are of joint_compatibility; guards are of all methods.
-    """
-
-    method: Literal["nearest_neighbour", "maximum_likelihood", "joint_compatibility"] = "joint_compatibility"
-    gate_probability: InnerProbability = 0.99
-    joint_gate_probability: InnerProbability = 0.99
-    cost_unpaired: Positive = 13.0
-    ambiguity_margin: NotNegative = 5.0
-    birth_gate_probability: InnerProbability = 0.99999
-    nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
 
 
 class PublishSettings(Settings):

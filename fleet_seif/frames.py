@@ -9,27 +9,31 @@
 5. Where frames start, and the map, is the joint solution of this vehicle's own frames, the open one included: whoever
    owns the filter calls `localise` after a step. Between two solutions the open frame's filter goes on from there.
 6. With frames = "single" there is one, which closes at the end and is never corrected.
+7. Where nothing tells which landmark a sighting is of (identities = "associated"), an Associator decides, against what
+   the closed frames say about where the open one starts and what lies around it (own_map).
 """
 
+import dataclasses
 import logging
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from fleet_seif.associator import NONE, Associator, Decision
 from fleet_seif.config import FilterSettings
 from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.errors import NumericalError
-from fleet_seif.filters import Names, StepResult
-from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
+from fleet_seif.filters import Names, StepResult, checked_reading
 from fleet_seif.frame_deltas import quantised
+from fleet_seif.frame_log import FrameLog
 from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_names
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
-from fleet_seif.records import Floats, Ints, Reading, Sightings
+from fleet_seif.own_map import OwnMap
+from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 from fleet_seif.seif import Seif, Taken
 
 log = logging.getLogger(__name__)
@@ -37,73 +41,12 @@ FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
 
 
-@dataclass
-class FrameLog:
-    """The readings of one frame, and the live estimate after each: what its batch is made from.
-
-    motions: odometry, its covariance, and the pose after it. sightings: the number of motions before, signatures, z and
-    their covariances.
-    """
-
-    motions: list[tuple[Floats, Floats, Floats]] = field(default_factory=list)
-    sightings: list[tuple[int, Ints, Floats, Floats]] = field(default_factory=list)
-    heading_variance: float = 0.0
-
-    def add(self, moves: bool, taken: Taken, pose: Floats) -> None:
-        """One step: the motion (none before any), and what was seen. The arrays are kept."""
-        u, cov, z, Z, signature = taken
-        if moves:
-            self.motions.append((u, cov, pose))
-            self.heading_variance += float(cov[2, 2])
-        if len(signature):
-            self.sightings.append((len(self.motions), signature, z, Z))
-
-    def state(self) -> tuple[Any, ...]:
-        """Plain values for msgpack; `restored` takes them back."""
-        seen = [
-            (step, names.astype(np.int64).tobytes(), z.tobytes(), Z.tobytes()) for step, names, z, Z in self.sightings
-        ]
-        motions = [tuple(array.tobytes() for array in motion) for motion in self.motions]
-        return motions, seen, self.heading_variance
-
-    @staticmethod
-    def restored(state: tuple[Any, ...]) -> "FrameLog":
-        motions, seen, heading_variance = state
-        return FrameLog(
-            motions=[
-                (np.frombuffer(u), np.frombuffer(cov).reshape(3, 3), np.frombuffer(pose)) for u, cov, pose in motions
-            ],
-            sightings=[
-                (
-                    step, np.frombuffer(names, np.int64), np.frombuffer(z).reshape(-1, 2),
-                    np.frombuffer(Z).reshape(-1, 2, 2),
-                )
-                for step, names, z, Z in seen
-            ],
-            heading_variance=heading_variance,
-        )  # fmt: skip
-
-    def solved(self, model: int, signatures: Ints, landmarks: Floats, huber: float | None) -> FrameSolution:
-        """The batch over these readings, from the live estimates on; signatures of its landmarks (n,), m (n, 2).
-
-        huber: see FilterSettings.frame_huber.
-
-        Raises NumericalError.
-        """
-        steps = [np.full(len(names), step) for step, names, _, _ in self.sightings]
-        none, order = Sightings.none(), np.argsort(signatures)
-        seen = np.concatenate([*(names for _, names, _, _ in self.sightings), none.signature]).astype(np.int64)
-        readings = FrameReadings(
-            model=model,
-            odometry=np.array([u for u, _, _ in self.motions]).reshape(-1, 3),
-            odometry_cov=np.array([cov for _, cov, _ in self.motions]).reshape(-1, 3, 3),
-            step=np.concatenate([*steps, none.signature]).astype(np.int64),
-            landmark=order[np.searchsorted(signatures, seen, sorter=order)],
-            z=np.concatenate([*(z for _, _, z, _ in self.sightings), none.z]),
-            cov=np.concatenate([*(Z for _, _, _, Z in self.sightings), none.cov]),
-        )
-        poses = np.array([pose for _, _, pose in self.motions]).reshape(-1, 3)
-        return solve_frame(readings, poses, landmarks, bound=math.inf if huber is None else huber**2)
+def _told(seen: Sightings, decision: Decision | None) -> Sightings:
+    """The sightings that the filter takes, by the numbers of their landmarks."""
+    if decision is None:
+        return seen
+    told = decision.keys >= 0
+    return Sightings(z=np.asarray(seen.z)[told], cov=np.asarray(seen.cov)[told], signature=decision.keys[told])
 
 
 @dataclass
@@ -141,6 +84,9 @@ class FramedFilter:
             most = min(settings.landmarks_max, FRAME_LANDMARKS_MAX)
             self._frame_settings = settings.model_copy(update={"landmarks_max": most})
         self._closed: list[Closed] = []
+        self._associator = Associator(settings.association, model) if settings.identities == "associated" else None
+        self._own_map = OwnMap()
+        self._assigned: list[Ints] = []
         self._open()
 
     def _open(self) -> None:
@@ -152,7 +98,18 @@ class FramedFilter:
     @property
     def signatures(self) -> list[int]:
         """Signatures of the life's landmarks by number."""
+        if self._associator is not None:
+            return [UNKNOWN_SIGNATURE] * len(self._names.signatures)
         return self.filter.signatures if self._single else self._names.signatures
+
+    @property
+    def assigned(self) -> Ints:
+        """Which landmark each sighting taken so far is of, by number, -1 none, shape (s,)."""
+        keys = np.concatenate([*self._assigned, np.empty(0, np.int64)]).astype(np.int64)
+        if self._associator is not None:
+            return np.maximum(keys, NONE)
+        numbers = {signature: number for number, signature in enumerate(self.signatures)}
+        return np.array([numbers[key] for key in keys.tolist()], np.int64)
 
     @property
     def pose(self) -> Floats:
@@ -223,20 +180,37 @@ class FramedFilter:
 
     def start(self, sightings: Sightings) -> tuple[StepResult, tuple[FramePart, ...]]:
         """What is seen before any motion: the first part of frame 0. Parts are what to publish."""
-        return self._take(False, self.filter.start(sightings))
+        decision = self._decide(None, sightings)
+        result = self.filter.start(_told(sightings, decision))
+        return self._take(False, result, sightings, decision)
 
     def step(self, reading: Reading) -> tuple[StepResult, tuple[FramePart, ...]]:
         """One reading. Raises what Seif.step raises; nothing has changed then."""
-        result = self.filter.step(reading)
+        decision = self._decide((reading.odometry, reading.odometry_cov), reading.sightings)
+        result = self.filter.step(dataclasses.replace(reading, sightings=_told(reading.sightings, decision)))
         self.steps += 1
-        return self._take(True, result)
+        return self._take(True, result, reading.sightings, decision)
 
-    def _take(self, moves: bool, result: StepResult) -> tuple[StepResult, tuple[FramePart, ...]]:
+    def _decide(self, motion: tuple[Floats, Floats] | None, seen: Sightings) -> Decision | None:
+        if self._associator is None:
+            return None
+        u, cov = motion or (np.zeros(3), np.eye(3))
+        u, cov, z, Z, _ = checked_reading(u, cov, dataclasses.replace(seen, signature=np.full(len(seen.z), NONE)))
+        known = len(self._names.signatures)
+        return self._associator.decide(self.steps + (motion is not None), motion and (u, cov), z, Z, known)
+
+    def _take(
+        self, moves: bool, result: StepResult, seen: Sightings, decision: Decision | None
+    ) -> tuple[StepResult, tuple[FramePart, ...]]:
         frame, status = self.frame, FrameStatus.CONTINUED if self._opened else FrameStatus.OPENED
         self._opened = True
+        taken = self.filter.taken
+        if decision is not None:
+            result, taken = self._take_decision(decision, result, seen)
+        self._assigned.append(taken[4])
         if self._single:
             return result, (FramePart(frame=frame, status=status, delta=result.delta),)
-        self._log.add(moves, self.filter.taken, self.filter.pose)
+        self._log.add(moves, taken, self.filter.pose)
         if not self._is_over():
             parts = [FramePart(frame=frame, status=status, delta=result.delta)]
         elif status is FrameStatus.CONTINUED:
@@ -251,12 +225,30 @@ class FramedFilter:
             parts += self._correction(self._closed.pop(0))
         return result, tuple(parts)
 
+    def _take_decision(self, decision: Decision, result: StepResult, seen: Sightings) -> tuple[StepResult, Taken]:
+        """What sightings were taken for holds from now on: the step as published, and as it is kept."""
+        assert self._associator is not None
+        z, Z = np.array(seen.z, float), np.array(seen.cov, float)
+        self._associator.take(decision, z)
+        for key, number in decision.accepted.items():
+            for log_ in (self._log, *(closed.log for closed in self._closed)):
+                log_.rename(key, number)
+            for keys in self._assigned[-self.settings.association.confirm_steps :]:
+                keys[keys == key] = number
+        new = (UNKNOWN_SIGNATURE,) * len(result.new)
+        result = dataclasses.replace(
+            result, new=new, innovation=decision.innovation, sightings=decision.dof // 2,
+        )  # fmt: skip
+        u, cov, *_ = self.filter.taken
+        return result, (u, cov, z, Z, decision.keys)
+
     def _is_over(self) -> bool:
         settings, readings = self.settings, self._log
         return (
             len(readings.motions) >= settings.frame_steps_max
             or len(self.filter.called) >= settings.frame_landmarks_max
             or readings.heading_variance >= settings.frame_heading_std_max_rad**2
+            or (self._associator is not None and self._associator.has_left(self.filter.pose))
         )
 
     def _close(self) -> Floats:
@@ -269,32 +261,55 @@ class FramedFilter:
         self.totals.append(FrameTotal())
         self.totals[-1].add(live.published())
         self.ends.append(end_pose)
+        if self._associator is not None:
+            self._look_around(self._closed[-1], self._associator)
         self._open()
         return end_pose
 
-    def _correction(self, closed: Closed) -> list[FramePart]:
-        """What the batch over a closed frame changes, to be published; nothing where it fails, or nothing moved."""
+    def _look_around(self, closed: Closed, associator: Associator) -> None:
+        """What lies around the end of a frame that closes, for the next."""
+        solved = self._solved(closed)
+        self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
+        near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
+        associator.begin(*near)
+
+    def _solved(self, closed: Closed) -> tuple[FrameDelta, Floats] | None:
+        """The batch over a closed frame as one cumulative delta, and its end pose; None where it fails."""
         if not closed.log.motions:
-            return []
-        total = self.totals[closed.frame]
+            return None
+        signatures, landmarks, numbers = closed.signatures, closed.landmarks, closed.numbers
+        if self._associator is not None:
+            signatures, landmarks = closed.log.guesses(self.model, signatures, landmarks)
+            numbers = signatures
         try:
-            batch = closed.log.solved(self.model, closed.signatures, closed.landmarks, self.settings.frame_huber)
-            order = np.argsort(closed.numbers)
+            batch = closed.log.solved(self.model, signatures, landmarks, self.settings.frame_huber)
+            order = np.argsort(numbers)
             order = order[batch.seen[order]]
             rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
-            variables = np.concatenate([[0], 1 + closed.numbers[order]]).astype(np.int64)
+            variables = np.concatenate([[0], 1 + numbers[order]]).astype(np.int64)
             H, b, mean = batch.H[np.ix_(rows, rows)], batch.b[rows], batch.mean[rows]
-            change = FrameTotal()
-            change.add(quantised(variables, H, b, mean))
+            return quantised(variables, H, b, mean), batch.mean[:3]
+        except NumericalError:
+            return None
+
+    def _correction(self, closed: Closed) -> list[FramePart]:
+        """What the batch over a closed frame changes, to be published; nothing where it fails, or nothing moved."""
+        solved, total = self._solved(closed), self.totals[closed.frame]
+        if solved is None:
+            return []
+        whole, end_pose = solved
+        change = FrameTotal()
+        try:
+            change.add(whole)
             change.subtract(total.delta())
         except NumericalError:
             return []
         delta = change.delta()
         total.add(delta)
-        self.ends[closed.frame] = batch.mean[:3]
-        return [
-            FramePart(frame=closed.frame, status=FrameStatus.CORRECTED, delta=delta, end_pose=self.ends[closed.frame])
-        ]
+        self.ends[closed.frame] = end_pose
+        if self._associator is not None:
+            self._own_map.put(closed.frame, whole)
+        return [FramePart(frame=closed.frame, status=FrameStatus.CORRECTED, delta=delta, end_pose=end_pose)]
 
     def end(self) -> tuple[FramePart, ...]:
         """Close the open frame and correct all that is outstanding."""
@@ -311,7 +326,11 @@ class FramedFilter:
 
     def state(self) -> dict[str, Any]:
         """All that it knows, as plain values for msgpack; `restore` takes it back."""
-        state = {"filter": self.filter.state(), "steps": self.steps, "opened": self._opened}
+        assigned = np.concatenate([*self._assigned, np.empty(0, np.int64)]).astype(np.int64)
+        state = {
+            "filter": self.filter.state(), "steps": self.steps, "opened": self._opened, "assigned": assigned.tobytes(),
+            "associator": self._associator and self._associator.state(),
+        }  # fmt: skip
         if self._single:
             return state
         closed = [
@@ -322,8 +341,9 @@ class FramedFilter:
             for each in self._closed
         ]  # fmt: skip
         return {
-            **state, "signatures": self.signatures, "log": self._log.state(), "closed": closed,
-            "totals": [pack_delta(total.delta()) for total in self.totals], "ends": np.array(self.ends).tobytes(),
+            **state, "signatures": self._names.signatures, "log": self._log.state(), "closed": closed,
+            "totals": [pack_delta(total.delta()) for total in self.totals],
+            "own": [pack_delta(delta) for delta in self._own_map.frames], "ends": np.array(self.ends).tobytes(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -332,6 +352,9 @@ class FramedFilter:
             self._names.add(list(state["signatures"]))
         self.filter.restore(state["filter"])
         self.steps, self._opened = state["steps"], state["opened"]
+        self._assigned = [np.frombuffer(state["assigned"], np.int64).copy()]
+        if self._associator is not None:
+            self._associator.restore(state["associator"])
         if self._single:
             return
         self._localised = self.steps - self.settings.localise_steps
@@ -346,6 +369,7 @@ class FramedFilter:
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
+        self._own_map.frames = [read_delta(data) for data in state["own"]]
         self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
 
     def published(self) -> tuple[FrameDelta, ...]:

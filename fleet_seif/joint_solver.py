@@ -97,7 +97,7 @@ class JointSolver:
 
     @one_thread
     def joint_covariance(self, solution: JointSolution, landmarks: Ints, poses: Ints) -> Floats:
-        """Exact joint covariance of some rows of the last solution: poses, then landmarks, shape (3 p + 2 k, 3 p + 2 k).
+        """Exact joint covariance of some rows of the last solution: poses, then landmarks, shape (n, n).
 
         Linearised where its frames were last, robust weights included.
 

@@ -89,7 +89,7 @@ def _seen(spread: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
 
 @kernel
 def expected(model: int, mean: Floats, P: Floats, which: Ints) -> tuple[Floats, Floats]:
-    """What is expected of these landmarks: h (c, 2), and the joint covariance J P J' (2 c, 2 c) without sensor noise."""
+    """Sightings of these landmarks: expected h (c, 2), their joint covariance J P J' (2 c, 2 c) without sensor noise."""
     h, J_x, J_y = _blocks(model, mean, which)
     return h, _seen(_spread(P, which, J_x, J_y), which, J_x, J_y)
 
@@ -105,7 +105,7 @@ def in_reach(mean: Floats, P: Floats, reach: float, sigmas: float) -> Ints:
         for k in range(2):
             variance += P[a + k, a + k] + P[k, k] - 2.0 * P[a + k, k]
         most = reach + sigmas * np.sqrt(max(variance, 0.0))
-        if dx * dx + dy * dy <= most * most:
+        if 0.0 < dx * dx + dy * dy <= most * most:
             found[count] = i
             count += 1
     return found[:count]

@@ -117,7 +117,7 @@ class VehicleCore:
         self._required, self._signer, self._keys = required, signer, keys
         self._durable = durable
         self._heartbeat_at_s = -math.inf
-        self._given: list[Ints] = []
+        self._given: list[int] = []
         self._reading_bytes = 0
         self._state_bytes = STATE_BYTES_LEAST
         self._kept: list[Change] = []
@@ -240,7 +240,7 @@ class VehicleCore:
             state = msgpack.unpackb(kept[records.STATE], use_list=False)
             self.filter.restore(state["filter"])
             self.steps, self.time_s, self.healthy = state["steps"], state["time_s"], state["healthy"]
-            self._given = [np.frombuffer(state["given"], np.int64)]
+            self._given = list(state["given"])
         for key in sorted(name for name in kept if name[:1] == records.READING):
             reading, mark = records.read_reading(kept[key])
             step = int.from_bytes(key[1:], "big")
@@ -251,7 +251,7 @@ class VehicleCore:
                     " another kind of machine: begin a fresh life"
                 )
             self.steps, self.time_s = step, reading.time_s
-            self._given.append(reading.sightings.signature)
+            self._given.append(len(reading.sightings.z))
             self._reading_bytes += len(kept[key])
         newest = self.outbox.newest
         if newest is not None:
@@ -278,9 +278,11 @@ class VehicleCore:
     @property
     def assigned(self) -> Ints:
         """The number of the landmark that each sighting given so far is of, -1 none (of a refused reading), (S,)."""
-        numbers = {signature: number for number, signature in enumerate(self.filter.signatures)}
-        given = np.concatenate([*self._given, np.empty(0, np.int64)])
-        return np.array([numbers.get(signature, -1) for signature in given.tolist()], np.int64)
+        taken, at, found = self.filter.assigned, 0, [np.empty(0, np.int64)]
+        for count in self._given:
+            found.append(taken[at : at + count] if count > 0 else np.full(-count, UNKNOWN_SIGNATURE))
+            at += max(count, 0)
+        return np.concatenate(found)
 
     def start(self, time_s: float, sightings: Sightings) -> StepResult:
         """Sequence 0: the hello, and what is seen before any motion."""
@@ -288,7 +290,7 @@ class VehicleCore:
         if self.outbox.last >= 0:
             raise ReadingRefused("this vehicle has already started")
         result, parts = self.filter.start(sightings)
-        self._given.append(np.asarray(sightings.signature, np.int64))
+        self._given.append(len(sightings.z))
         self._keep(Reading(time_s=time_s, odometry=np.zeros(3), odometry_cov=np.eye(3), sightings=sightings), result)
         self._append(time_s, result, parts, self._hello(None))
         return result
@@ -316,7 +318,7 @@ class VehicleCore:
                 "steps": self.steps,
                 "time_s": reading.time_s,
                 "healthy": self.healthy,
-                "given": np.concatenate(self._given).tobytes(),
+                "given": self._given,
             }
             data = msgpack.packb(state)
             self._reading_bytes, self._state_bytes = 0, max(len(data), STATE_BYTES_LEAST)
@@ -341,7 +343,7 @@ class VehicleCore:
             self.healthy = False
             raise
         self.steps += 1
-        self._given.append(np.asarray(reading.sightings.signature, np.int64))
+        self._given.append(len(reading.sightings.z))
         self._keep(reading, result)
         self._append(reading.time_s, result, parts, None)
         return result
@@ -365,7 +367,7 @@ class VehicleCore:
 
     def _count_refused(self, sightings: Sightings) -> None:
         self.counters.readings_refused += 1
-        self._given.append(np.full(len(sightings.z), UNKNOWN_SIGNATURE))
+        self._given.append(-len(sightings.z))
 
     def _append(self, time_s: float, result: StepResult, parts: tuple[FramePart, ...], hello: Hello | None) -> None:
         self.time_s = time_s

@@ -1,0 +1,168 @@
+"""What a vehicle takes its sightings for, step by step, where nothing tells it (DESIGN D5, MATHS.md 19).
+
+1. Sightings are compared with the landmarks of a local map (fleet_seif.local_map), which they then improve.
+2. A sighting that fits nothing and is near nothing begins a provisional landmark. Once it has been sighted often enough
+   it is accepted and gets a number; its earlier sightings belong to it from then on. Else it is forgotten.
+3. Keys: the number of an accepted landmark; below NONE, a provisional one; NONE: not told, or nobody's.
+4. `decide` changes nothing; `take` does, once the filter has taken the step too.
+5. A function of this vehicle's own readings and settings alone.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from fleet_seif.association import associate
+from fleet_seif.association_guards import Verdict
+from fleet_seif.config import AssociationSettings
+from fleet_seif.errors import ReadingRefused
+from fleet_seif.local_map import LocalMap, begun_at, expected, in_reach, kept, moved, nothing_known, sighted, with_new
+from fleet_seif.models import COMPASS_XY
+from fleet_seif.records import Floats, Ints
+
+NONE: Final = -1
+REACH_SIGMAS: Final = 4.0
+"""How far beyond what was measured a landmark may be, in standard deviations, to be compared at all."""
+
+
+@dataclass(frozen=True)
+class Provisional:
+    """A landmark that has not been accepted. born: the step of its first sighting."""
+
+    born: int
+    sightings: int
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """What the sightings of one step are taken for.
+
+    keys (s,). accepted: provisional keys that have numbers from now on. innovation: squared normalised innovation of
+    the sightings of landmarks known before, chi-square of `dof` degrees of freedom.
+    """
+
+    keys: Ints
+    accepted: dict[int, int]
+    innovation: float
+    dof: int
+    local: LocalMap
+    provisional: dict[int, Provisional]
+    next: int
+
+
+class Associator:
+    """See the rules above. travel_max_m: how far from the frame's start the local map is whole."""
+
+    def __init__(self, settings: AssociationSettings, model: int) -> None:
+        self.settings = settings
+        self.model = model
+        self.local = nothing_known()
+        self.travel_max_m = np.inf
+        self.reach_m = 0.0
+        self._provisional: dict[int, Provisional] = {}
+        self._next = NONE - 1
+
+    def decide(self, step: int, motion: tuple[Floats, Floats] | None, z: Floats, Z: Floats, known: int) -> Decision:
+        """Raises ReadingRefused where a sighting is none, NumericalError where the local map cannot be.
+
+        Args:
+            motion: odometry and its covariance. z (s, 2), Z (s, 2, 2). known: landmarks that have a number.
+        """
+        _check(z, Z)
+        local = self.local if motion is None else moved(self.model, self.local, *motion)
+        near = in_reach(local.mean, local.P, _reach(self.model, z, Z), REACH_SIGMAS)
+        found = associate(z, Z, *expected(self.model, local.mean, local.P, near), self.settings, model=self.model)
+        paired = np.flatnonzero(found.assignment >= 0)
+        which = near[found.assignment[paired]]
+        keys = np.full(len(z), NONE)
+        keys[paired] = local.keys[which]
+        local, innovation = sighted(self.model, local, which, z[paired], Z[paired])
+        provisional, key = dict(self._provisional), self._next
+        for i in np.flatnonzero(found.verdict == Verdict.NEW).tolist():
+            local = with_new(self.model, local, key, z[i], Z[i])
+            keys[i], provisional[key] = key, Provisional(step, 0)
+            key -= 1
+        for each in keys[keys < NONE].tolist():
+            provisional[each] = Provisional(provisional[each].born, provisional[each].sightings + 1)
+        return self._settled(step, known, Decision(keys, {}, innovation, 2 * len(paired), local, provisional, key))
+
+    def _settled(self, step: int, known: int, made: Decision) -> Decision:
+        """Provisional landmarks that are accepted now, and those that are forgotten."""
+        settings, accepted, gone = self.settings, made.accepted, set[int]()
+        for key in made.keys[made.keys < NONE].tolist():  # in the order of sightings: that of numbers
+            if made.provisional[key].sightings >= settings.confirm_sightings:
+                accepted[key] = known + len(accepted)
+        for key, each in made.provisional.items():
+            if key not in accepted and step - each.born >= settings.confirm_steps - 1:
+                gone.add(key)
+        for key in (*accepted, *gone):
+            del made.provisional[key]
+        local = made.local
+        if accepted or gone:
+            names = np.array([accepted.get(key, key) for key in local.keys.tolist()], np.int64)
+            local = LocalMap(local.mean, local.P, names)
+            local = kept(local, np.flatnonzero(~np.isin(names, list(gone)))) if gone else local
+        keys = np.array([accepted.get(key, key) for key in made.keys.tolist()], np.int64)
+        return replace(made, keys=keys, local=local)
+
+    def take(self, decision: Decision, z: Floats) -> None:
+        """The step has been taken."""
+        self.local, self._provisional, self._next = decision.local, decision.provisional, decision.next
+        if len(z):
+            self.reach_m = max(self.reach_m, float(_distances(self.model, z).max()))
+
+    def has_left(self, pose: Floats) -> bool:
+        """Whether this pose in the frame is so far from its start that the local map may lack what is sighted."""
+        return bool(np.hypot(pose[0], pose[1]) >= self.travel_max_m)
+
+    def begin(self, near: LocalMap, travel_max_m: float) -> None:
+        """A frame begins where the vehicle is: with these landmarks, as seen from there, and the provisional ones."""
+        carried = np.flatnonzero(self.local.keys < NONE)
+        self.local, self.travel_max_m = beside(near, begun_at(kept(self.local, carried))), travel_max_m
+
+    def state(self) -> dict[str, Any]:
+        """Plain values for msgpack; `restore` takes them back."""
+        local = self.local
+        return {
+            "mean": local.mean.tobytes(), "P": local.P.tobytes(), "keys": local.keys.tobytes(), "next": self._next,
+            "travel": self.travel_max_m, "reach": self.reach_m,
+            "provisional": [(key, each.born, each.sightings) for key, each in self._provisional.items()],
+        }  # fmt: skip
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on where `state` was taken, to the bit."""
+        mean = np.frombuffer(state["mean"])
+        P = np.frombuffer(state["P"]).reshape(len(mean), len(mean))
+        self.local = LocalMap(mean, P, np.frombuffer(state["keys"], np.int64))
+        self.travel_max_m, self.reach_m, self._next = state["travel"], state["reach"], state["next"]
+        self._provisional = {key: Provisional(born, sightings) for key, born, sightings in state["provisional"]}
+
+
+def beside(a: LocalMap, b: LocalMap) -> LocalMap:
+    """Landmarks of two maps with the same pose, which is certain; nothing links them."""
+    n, m = len(a.mean), len(b.mean) - 3
+    P = np.zeros((n + m, n + m))
+    P[:n, :n], P[n:, n:] = a.P, b.P[3:, 3:]
+    return LocalMap(np.concatenate([a.mean, b.mean[3:]]), P, np.concatenate([a.keys, b.keys]))
+
+
+def _distances(model: int, z: Floats) -> Floats:
+    return np.asarray(np.hypot(z[:, 0], z[:, 1]) if model == COMPASS_XY else z[:, 0])
+
+
+def _reach(model: int, z: Floats, Z: Floats) -> float:
+    """How far away the sightings may be at most, m."""
+    if not len(z):
+        return 0.0
+    return float(np.max(_distances(model, z) + REACH_SIGMAS * np.sqrt(Z[:, 0, 0] + (Z[:, 1, 1] if model else 0.0))))
+
+
+def _check(z: Floats, Z: Floats) -> None:
+    det = Z[:, 0, 0] * Z[:, 1, 1] - Z[:, 0, 1] * Z[:, 1, 0]
+    if np.all(np.isfinite(z)) and np.all(Z[:, 0, 0] > 0.0) and np.all(det > 0.0) and np.all(np.isfinite(det)):
+        return
+    raise ReadingRefused(
+        "reading refused: a sighting is not finite, or its covariance not positive definite: it cannot be told what it"
+        " is of; leave it out"
+    )

@@ -1,0 +1,99 @@
+"""The readings of one frame, kept until it is closed, and longer where nothing tells which landmark a sighting is of."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
+from fleet_seif.models import place
+from fleet_seif.records import Floats, Ints, Sightings
+from fleet_seif.seif import Taken
+
+
+@dataclass
+class FrameLog:
+    """The readings of one frame, and the live estimate after each: what its batch is made from.
+
+    motions: odometry, its covariance, and the pose after it. sightings: the number of motions before, signatures, z and
+    their covariances. A signature below 0 is nobody's, or not yet.
+    """
+
+    motions: list[tuple[Floats, Floats, Floats]] = field(default_factory=list)
+    sightings: list[tuple[int, Ints, Floats, Floats]] = field(default_factory=list)
+    heading_variance: float = 0.0
+
+    def add(self, moves: bool, taken: Taken, pose: Floats) -> None:
+        """One step: the motion (none before any), and what was seen. The arrays are kept."""
+        u, cov, z, Z, signature = taken
+        if moves:
+            self.motions.append((u, cov, pose))
+            self.heading_variance += float(cov[2, 2])
+        if len(signature):
+            self.sightings.append((len(self.motions), signature, z, Z))
+
+    def rename(self, old: int, new: int) -> None:
+        """Sightings of one signature have another from now on."""
+        for _, names, _, _ in self.sightings:
+            names[names == old] = new
+
+    def state(self) -> tuple[Any, ...]:
+        """Plain values for msgpack; `restored` takes them back."""
+        seen = [
+            (step, names.astype(np.int64).tobytes(), z.tobytes(), Z.tobytes()) for step, names, z, Z in self.sightings
+        ]
+        motions = [tuple(array.tobytes() for array in motion) for motion in self.motions]
+        return motions, seen, self.heading_variance
+
+    @staticmethod
+    def restored(state: tuple[Any, ...]) -> "FrameLog":
+        motions, seen, heading_variance = state
+        return FrameLog(
+            motions=[
+                (np.frombuffer(u), np.frombuffer(cov).reshape(3, 3), np.frombuffer(pose)) for u, cov, pose in motions
+            ],
+            sightings=[
+                (
+                    step, np.frombuffer(names, np.int64).copy(), np.frombuffer(z).reshape(-1, 2),
+                    np.frombuffer(Z).reshape(-1, 2, 2),
+                )
+                for step, names, z, Z in seen
+            ],
+            heading_variance=heading_variance,
+        )  # fmt: skip
+
+    def guesses(self, model: int, signatures: Ints, landmarks: Floats) -> tuple[Ints, Floats]:
+        """The landmarks that these sightings are of, (n,) and (n, 2) m: as estimated, or where the first one puts it."""
+        known = dict(zip(signatures.tolist(), landmarks, strict=True))
+        poses = [np.zeros(3), *(pose for _, _, pose in self.motions)]
+        for step, names, z, _ in self.sightings:
+            for name, each in zip(names.tolist(), z, strict=True):
+                if name >= 0 and name not in known:
+                    known[name] = place(model, poses[step], each)
+        return np.array(list(known), np.int64), np.array(list(known.values())).reshape(-1, 2)
+
+    def solved(self, model: int, signatures: Ints, landmarks: Floats, huber: float | None) -> FrameSolution:
+        """The batch over these readings, from the live estimates on; signatures of its landmarks (n,), m (n, 2).
+
+        huber: see FilterSettings.frame_huber.
+
+        Raises NumericalError.
+        """
+        none, order = Sightings.none(), np.argsort(signatures)
+        step = np.concatenate([*(np.full(len(names), step) for step, names, _, _ in self.sightings), none.signature])
+        seen = np.concatenate([*(names for _, names, _, _ in self.sightings), none.signature]).astype(np.int64)
+        z = np.concatenate([*(z for _, _, z, _ in self.sightings), none.z])
+        cov = np.concatenate([*(Z for _, _, _, Z in self.sightings), none.cov])
+        told = seen >= 0
+        readings = FrameReadings(
+            model=model,
+            odometry=np.array([u for u, _, _ in self.motions]).reshape(-1, 3),
+            odometry_cov=np.array([cov for _, cov, _ in self.motions]).reshape(-1, 3, 3),
+            step=step[told].astype(np.int64),
+            landmark=order[np.searchsorted(signatures, seen[told], sorter=order)],
+            z=z[told],
+            cov=cov[told],
+        )
+        poses = np.array([pose for _, _, pose in self.motions]).reshape(-1, 3)
+        return solve_frame(readings, poses, landmarks, bound=math.inf if huber is None else huber**2)

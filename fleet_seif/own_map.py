@@ -1,0 +1,54 @@
+"""A vehicle's own map of its closed frames, and what of it lies around where the next one begins.
+
+Solved anew, warm, when a frame closes: with what is around, it is a function of the vehicle's own readings alone. It
+serves association; nothing of it is published.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from fleet_seif.information import FrameDelta
+from fleet_seif.joint import JointSolver, Life, landmark_names
+from fleet_seif.local_map import LocalMap, seen_from
+from fleet_seif.records import UNKNOWN_SIGNATURE
+
+TRAVEL_LEAST: Final = 0.25
+"""Share of the reach of its sightings that a vehicle may always travel within a frame."""
+
+
+class OwnMap:
+    """See above. Frames are numbered from 0 on."""
+
+    def __init__(self) -> None:
+        self.frames: list[FrameDelta] = []
+        self._solver = JointSolver()
+
+    def put(self, frame: int, total: FrameDelta) -> None:
+        """What a frame says, for the first time or anew."""
+        if frame == len(self.frames):
+            self.frames.append(total)
+        self.frames[frame] = total
+
+    def around(self, most: int, reach_m: float) -> tuple[LocalMap, float]:
+        """The landmarks around the end of the last frame, as seen from there, and how far they are all there are.
+
+        At most so many, the nearest; reach_m: of the vehicle's sightings, which must find what they may be of.
+        Raises NumericalError where the frames cannot be solved.
+        """
+        last = max((int(delta.variables[-1]) for delta in self.frames if len(delta.variables)), default=0)
+        life = Life(
+            vehicle="", life=0, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)), frames=tuple(self.frames),
+            signatures=(UNKNOWN_SIGNATURE,) * last,
+        )  # fmt: skip
+        solution = self._solver.update([life], tuple((name,) for name in landmark_names(life)))
+        newest = [k for _, _, k in solution.poses].index(-1)
+        pose, landmarks = solution.pose_mean[newest], solution.landmark_mean
+        away = np.hypot(*(landmarks - pose[:2]).T)
+        order = np.argsort(away, kind="stable")
+        chosen, travel_max_m = np.sort(order[:most]), np.inf
+        if len(order) > most:
+            travel_max_m = max(float(away[order[most]]) - reach_m, TRAVEL_LEAST * reach_m)
+        P = self._solver.joint_covariance(solution, chosen, np.array([newest]))
+        numbers = np.array([names[0].number for names in solution.classes], np.int64)
+        return seen_from(pose, landmarks[chosen], P, numbers[chosen]), travel_max_m
