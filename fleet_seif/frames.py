@@ -64,6 +64,9 @@ class Closed:
     numbers: Ints
 
 
+KEPT_STEPS = 1000
+
+
 class FramedFilter:
     """See the rules above."""
 
@@ -229,11 +232,11 @@ class FramedFilter:
         """What sightings were taken for holds from now on: the step as published, and as it is kept."""
         assert self._associator is not None
         z, Z = np.array(seen.z, float), np.array(seen.cov, float)
-        self._associator.take(decision, z)
+        self._associator.take(self.steps, decision, z)
         for key, number in decision.accepted.items():
             for log_ in (self._log, *(closed.log for closed in self._closed)):
                 log_.rename(key, number)
-            for keys in self._assigned[-self.settings.association.confirm_steps :]:
+            for keys in self._assigned[-KEPT_STEPS:]:
                 keys[keys == key] = number
         new = (UNKNOWN_SIGNATURE,) * len(result.new)
         result = dataclasses.replace(
