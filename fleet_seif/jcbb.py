@@ -88,12 +88,12 @@ def workspace(p: Problem, gate: float) -> Work:
 
 
 @kernel
-def growth(s: Work, p: Problem, pairs: int, i: int, j: int) -> tuple[float, float]:
+def growth(K: Floats, seen: Floats, p: Problem, pairs: int, i: int, j: int) -> tuple[float, float]:
     """By how much r' S^-1 r and the cost grow when (i, j) joins the first `pairs` pairs; infinite if not PD."""
-    t00 = s.K[pairs, j, 0] + p.Z[i, 0, 0]
-    t10 = s.K[pairs, j, 1] + p.Z[i, 1, 0]
-    t11 = s.K[pairs, j, 2] + p.Z[i, 1, 1]
-    v0, v1 = p.r[i, j, 0] - s.seen[pairs, j, 0], p.r[i, j, 1] - s.seen[pairs, j, 1]
+    t00 = K[pairs, j, 0] + p.Z[i, 0, 0]
+    t10 = K[pairs, j, 1] + p.Z[i, 1, 0]
+    t11 = K[pairs, j, 2] + p.Z[i, 1, 1]
+    v0, v1 = p.r[i, j, 0] - seen[pairs, j, 0], p.r[i, j, 1] - seen[pairs, j, 1]
     d2, cost = normal_cost(t00, t10, t11, v0, v1)
     return d2, cost - p.log_det_Z[i]
 
@@ -141,7 +141,7 @@ def next_sighting(
         if s.open[i] == 1:
             for j in range(n):
                 if s.compatible[i, j] == 1 and s.free[j] == 1:
-                    d2, cost = growth(s, p, s.pairs[depth], i, j)
+                    d2, cost = growth(s.K, s.seen, p, s.pairs[depth], i, j)
                     if d2 <= d2_left and cost < cost_left:
                         left[i] += 1
                         least[i] = min(least[i], cost)
@@ -177,7 +177,7 @@ def open_level(s: Work, p: Problem, depth: int, levels: int, at: Limits, least: 
         count = 1
     for j in range(len(s.free)):
         if s.compatible[i, j] == 1 and s.free[j] == 1:
-            d2, cost = growth(s, p, k, i, j)
+            d2, cost = growth(s.K, s.seen, p, k, i, j)
             if cost < cost_left and d2 <= d2_left:
                 insert_sorted(s.costs[depth], s.candidates[depth], count, cost, j)
                 count += 1
@@ -200,7 +200,7 @@ def descend(s: Work, p: Problem, depth: int, least: float) -> bool:
     s.cost[depth + 1] = s.cost[depth] + s.costs[depth, turn]
     s.d2[depth + 1], s.pairs[depth + 1] = s.d2[depth], k
     if j >= 0:
-        s.d2[depth + 1] += growth(s, p, k, i, j)[0]
+        s.d2[depth + 1] += growth(s.K, s.seen, p, k, i, j)[0]
         s.pairs[depth + 1], s.free[j] = k + 1, 0
         pair_into(s, p, k, i, j)
     return True
