@@ -11,10 +11,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
-from fleet_seif.association_guards import PAIRED, Limits, leave_one_out, margins, verdicts
+from fleet_seif.association_guards import PAIRED, leave_one_out, margins, verdicts
+from fleet_seif.association_problem import UNPAIRED, Limits, Problem, is_sound, pair_cost, problem
 from fleet_seif.config import AssociationSettings
 from fleet_seif.errors import NumericalError
-from fleet_seif.jcbb import UNPAIRED, Problem, insert_sorted, is_sound, pair_cost, problem, search
+from fleet_seif.jcbb import cost_of_rival, insert_sorted, search
 from fleet_seif.jit import kernel
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Ints
@@ -26,11 +27,12 @@ class Association(NamedTuple):
     assignment: the candidate of each sighting that is PAIRED, else -1, shape (m,).
     verdict: a Verdict each, shape (m,).
     hypothesis: what the method chose, before the guards: candidate or -1, shape (m,).
-    margin: by how much the joint cost of the hypothesis grows at least when this sighting alone changes to a candidate
-        that is free in it; infinite where none is within the birth gate, shape (m,).
+    margin: by how much the joint cost grows at least when this sighting changes to another candidate, shape (m,):
+        alone, to one that is free and within the birth gate, or (joint rivals; where it is below the ambiguity margin)
+        with others changing too. Infinite where there is none.
     squared_innovation: r' S^-1 r of the hypothesis, chi-square of 2 pairs degrees of freedom if it is true.
     pairs: of the hypothesis.
-    cut_short: the search ended at nodes_max; the hypothesis is the best it had found.
+    cut_short: a search ended at nodes_max: the hypothesis, or a rival, is the best it had found.
     """
 
     assignment: Ints
@@ -49,7 +51,7 @@ JOINT_COMPATIBILITY: Final = 2
 
 
 @kernel
-def nearest_neighbour(p: Problem, at: Limits) -> tuple[Ints, bool]:
+def nearest_neighbour(p: Problem, at: Limits) -> tuple[Ints, Floats, bool]:
     """Each sighting takes the candidate of least r' S^-1 r, where that passes the gate.
 
     Where several take the same, the nearest keeps it; the others stay unpaired.
@@ -66,11 +68,11 @@ def nearest_neighbour(p: Problem, at: Limits) -> tuple[Ints, bool]:
         if owner[nearest] >= 0:
             assignment[owner[nearest]] = UNPAIRED
         owner[nearest], assignment[i] = i, nearest
-    return assignment, False
+    return assignment, np.full(m, np.inf), False
 
 
 @kernel
-def maximum_likelihood(p: Problem, at: Limits) -> tuple[Ints, bool]:
+def maximum_likelihood(p: Problem, at: Limits) -> tuple[Ints, Floats, bool]:
     """The likeliest pair first, of those that pass the gate, then the likeliest of what is left (Liu & Thrun).
 
     Likeliest: least r' S^-1 r + log(det S / det Z), each pair by itself. A candidate that is taken is out: a landmark
@@ -88,14 +90,17 @@ def maximum_likelihood(p: Problem, at: Limits) -> tuple[Ints, bool]:
         i, j = pair // n, pair % n
         if assignment[i] == UNPAIRED and taken[j] == 0:
             assignment[i], taken[j] = j, 1
-    return assignment, False
+    return assignment, np.full(m, np.inf), False
 
 
 @kernel
-def joint_compatibility(p: Problem, at: Limits) -> tuple[Ints, bool]:
-    """The joint hypothesis of least cost (`jcbb`)."""
-    assignment, _, cut_short = search(p, at.gate, at.joint_gates, at.cost_unpaired, at.nodes_max)
-    return assignment, cut_short
+def joint_compatibility(p: Problem, at: Limits) -> tuple[Ints, Floats, bool]:
+    """The joint hypothesis of least cost (`jcbb`), and how much more joint rivals cost if they are asked for, (m,)."""
+    hypothesis, least, _, cut_short = search(p, at, at.nodes_max, -1, -1, np.inf)
+    if not at.joint_rivals:
+        return hypothesis, np.full(len(hypothesis), np.inf), cut_short
+    more, rivals_cut_short = cost_of_rival(p, at, hypothesis, least)
+    return hypothesis, more, cut_short or rivals_cut_short
 
 
 @kernel
@@ -106,13 +111,13 @@ def decide(
     p = problem(model, z, Z, h, C)
     sound = is_sound(p)
     if not sound or method == NEAREST_NEIGHBOUR:
-        hypothesis, cut_short = nearest_neighbour(p, at)
+        hypothesis, margin, cut_short = nearest_neighbour(p, at)
     elif method == MAXIMUM_LIKELIHOOD:
-        hypothesis, cut_short = maximum_likelihood(p, at)
+        hypothesis, margin, cut_short = maximum_likelihood(p, at)
     else:
-        hypothesis, cut_short = joint_compatibility(p, at)
+        hypothesis, margin, cut_short = joint_compatibility(p, at)
     known = leave_one_out(p, hypothesis)
-    margin = margins(p, hypothesis, known, at)
+    margin = np.minimum(margin, margins(p, hypothesis, known, at))
     verdict = verdicts(p, hypothesis, margin, at)
     assignment = hypothesis.copy()
     for i in range(len(z)):
@@ -135,6 +140,7 @@ def limits(settings: AssociationSettings, m: int) -> Limits:
         birth_gate=float(2.0 * gammaincinv(1.0, settings.birth_gate_probability)),
         cost_unpaired=settings.cost_unpaired,
         ambiguity_margin=settings.ambiguity_margin,
+        joint_rivals=settings.rivals == "joint",
         nodes_max=settings.nodes_max,
     )
 
@@ -148,6 +154,9 @@ def associate(
         z: the sightings of one step, range (m) and bearing (rad), shape (m, 2). Z: their noise covariance, (m, 2, 2).
         h: what is expected of each candidate, shape (n, 2).
         C: joint covariance J P J' of these expectations, without sensor noise, shape (2n, 2n).
+        model: of the sightings, as in `models`; says which of their rows wrap.
+
+    All arrays C-contiguous float64, or kernels are compiled anew.
 
     Raises:
         ValueError: shapes that do not go together.

@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from fleet_seif.association_problem import Limits, Problem, normal_cost
 from fleet_seif.dense import cholesky_into, solve_lower_into, solve_upper_into
-from fleet_seif.jcbb import Problem, normal_cost
 from fleet_seif.jit import kernel
 from fleet_seif.records import Floats, Ints
 
@@ -34,20 +34,6 @@ PAIRED: Final = int(Verdict.PAIRED)
 AMBIGUOUS: Final = int(Verdict.AMBIGUOUS)
 NEAR: Final = int(Verdict.NEAR)
 NEW: Final = int(Verdict.NEW)
-
-
-class Limits(NamedTuple):
-    """The settings as kernels take them; gates are squared normalised innovations.
-
-    joint_gates: by number of pairs, shape (m + 1,).
-    """
-
-    gate: float
-    joint_gates: Floats
-    birth_gate: float
-    cost_unpaired: float
-    ambiguity_margin: float
-    nodes_max: int
 
 
 class Known(NamedTuple):

@@ -29,7 +29,7 @@ class AssociationSettings(Settings):
     map there are per 2 pi standard deviations of sensor noise in range times bearing.
     ambiguity_margin: a pair is doubtful where another candidate costs less than this more.
     birth_gate_probability: chance that a landmark's own sighting is within the gate in which none is born beside it.
-    nodes_max: partial hypotheses looked at after which the best so far is taken.
+    nodes_max: partial hypotheses looked at after which the best so far is taken, and again for all rivals together.
     confirm_sightings, confirm_steps: a new landmark is provisional until it has been sighted so many times within so
     many steps, the first included; else it is forgotten: clutter, or something that moves.
     awake_steps: steps after its last sighting from which on a landmark is dormant. wake_together: so many dormant ones
@@ -46,7 +46,7 @@ class AssociationSettings(Settings):
     cost_unpaired: Positive = 13.0
     ambiguity_margin: NotNegative = 5.0
     birth_gate_probability: InnerProbability = 0.99999
-    nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
+    nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 500
     confirm_sightings: Annotated[int, Field(ge=1, le=100)] = 3
     confirm_steps: Annotated[int, Field(ge=1, le=1000)] = 8
     awake_steps: Annotated[int, Field(ge=1, le=100_000)] = 25

@@ -16,82 +16,13 @@ they are kept for every candidate, two columns longer with each pair, and a pair
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from fleet_seif.association_problem import UNPAIRED, Limits, Problem, normal_cost
 from fleet_seif.jit import kernel
-from fleet_seif.models import innovation_numbers
 from fleet_seif.records import Floats, Ints
-
-UNPAIRED: Final = -1
-
-
-class Problem(NamedTuple):
-    """What one decision is about, for m sightings and n candidates.
-
-    r: innovation of every pair, angles wrapped, m and rad, shape (m, n, 2).
-    Z: noise covariance of the sightings, shape (m, 2, 2). C: joint covariance of the predictions, shape (2n, 2n).
-    log_det_Z: shape (m,).
-    d2: squared normalised innovation of every pair by itself, shape (m, n).
-    """
-
-    r: Floats
-    Z: Floats
-    C: Floats
-    log_det_Z: Floats
-    d2: Floats
-
-
-@kernel
-def problem(model: int, z: Floats, Z: Floats, h: Floats, C: Floats) -> Problem:
-    """Innovations of all pairs, and what each amounts to by itself; infinite where S is not positive definite."""
-    m, n = len(z), len(h)
-    r, log_det_Z, d2 = np.empty((m, n, 2)), np.empty(m), np.full((m, n), np.inf)
-    for i in range(m):
-        log_det_Z[i] = math.log(Z[i, 0, 0] * Z[i, 1, 1] - Z[i, 1, 0] * Z[i, 1, 0])
-        for j in range(n):
-            r0, r1 = innovation_numbers(model, z[i, 0], z[i, 1], h[j, 0], h[j, 1])
-            r[i, j, 0], r[i, j, 1] = r0, r1
-            s00 = C[2 * j, 2 * j] + Z[i, 0, 0]
-            s10 = C[2 * j + 1, 2 * j] + Z[i, 1, 0]
-            s11 = C[2 * j + 1, 2 * j + 1] + Z[i, 1, 1]
-            det = s00 * s11 - s10 * s10
-            if s00 > 0.0 and det > 0.0:
-                d2[i, j] = (s11 * r0 * r0 - 2.0 * s10 * r0 * r1 + s00 * r1 * r1) / det
-    return Problem(r, Z, C, log_det_Z, d2)
-
-
-@kernel
-def is_sound(p: Problem) -> bool:
-    """Whether every pair has a finite innovation with a positive definite covariance, and so has every noise."""
-    m, n = p.d2.shape
-    for i in range(m):
-        if not math.isfinite(p.log_det_Z[i]) or not p.Z[i, 0, 0] > 0.0:
-            return False
-        for j in range(n):
-            if not math.isfinite(p.d2[i, j]):
-                return False
-    return True
-
-
-@kernel
-def normal_cost(t00: float, t10: float, t11: float, v0: float, v1: float) -> tuple[float, float]:
-    """v' T^-1 v of a symmetric T, and the same with log det T; infinite where T is not positive definite."""
-    det = t00 * t11 - t10 * t10
-    if not (t00 > 0.0 and det > 0.0):
-        return np.inf, np.inf
-    d2 = (t11 * v0 * v0 - 2.0 * t10 * v0 * v1 + t00 * v1 * v1) / det
-    return d2, d2 + math.log(det)
-
-
-@kernel
-def pair_cost(p: Problem, i: int, j: int) -> float:
-    """r' S^-1 r + log(det S / det Z) of one pair by itself."""
-    a = 2 * j
-    s00, s10, s11 = p.C[a, a] + p.Z[i, 0, 0], p.C[a + 1, a] + p.Z[i, 1, 0], p.C[a + 1, a + 1] + p.Z[i, 1, 1]
-    _, cost = normal_cost(s00, s10, s11, p.r[i, j, 0], p.r[i, j, 1])
-    return cost - float(p.log_det_Z[i])
 
 
 class Work(NamedTuple):
@@ -102,7 +33,9 @@ class Work(NamedTuple):
     seen (m + 1, n, 2), K (m + 1, n, 3): by number of pairs, what these say about a candidate's innovation, and what
     is left of its C_jj: (0, 0), (1, 0), (1, 1).
     free (n,), open (m,): candidates that are not taken and sightings that are not decided.
-    costs, candidates (m, n + 1): by depth, what may become of its sighting, the cheapest first.
+
+    By depth: sighting, the one that is decided there; costs, candidates (m, n + 1), what may become of it, the cheapest
+    first, `choices` of them, `turn` of them had; chosen; cost, d2, pairs (m + 1,) of the prefix that leads there.
     """
 
     compatible: Ints
@@ -112,8 +45,15 @@ class Work(NamedTuple):
     K: Floats
     free: Ints
     open: Ints
+    sighting: Ints
     costs: Floats
     candidates: Ints
+    choices: Ints
+    turn: Ints
+    chosen: Ints
+    cost: Floats
+    d2: Floats
+    pairs: Ints
 
 
 @kernel
@@ -141,18 +81,19 @@ def workspace(p: Problem, gate: float) -> Work:
             if p.d2[i, j] <= gate:
                 compatible[i, j] = open_[i] = some[j] = 1
     return Work(
-        compatible, places(some), np.empty((n, 2, 2 * m)), np.zeros((m + 1, n, 2)), K, np.ones(n, np.int64),
-        open_, np.empty((m, n + 1)), np.empty((m, n + 1), np.int64),
+        compatible, places(some), np.empty((n, 2, 2 * m)), np.zeros((m + 1, n, 2)), K, np.ones(n, np.int64), open_,
+        np.full(m, -1), np.empty((m, n + 1)), np.empty((m, n + 1), np.int64), np.zeros(m, np.int64),
+        np.zeros(m, np.int64), np.full(m, UNPAIRED), np.zeros(m + 1), np.zeros(m + 1), np.zeros(m + 1, np.int64),
     )  # fmt: skip
 
 
 @kernel
-def growth(s: Work, p: Problem, pairs: int, i: int, j: int) -> tuple[float, float]:
+def growth(K: Floats, seen: Floats, p: Problem, pairs: int, i: int, j: int) -> tuple[float, float]:
     """By how much r' S^-1 r and the cost grow when (i, j) joins the first `pairs` pairs; infinite if not PD."""
-    t00 = s.K[pairs, j, 0] + p.Z[i, 0, 0]
-    t10 = s.K[pairs, j, 1] + p.Z[i, 1, 0]
-    t11 = s.K[pairs, j, 2] + p.Z[i, 1, 1]
-    v0, v1 = p.r[i, j, 0] - s.seen[pairs, j, 0], p.r[i, j, 1] - s.seen[pairs, j, 1]
+    t00 = K[pairs, j, 0] + p.Z[i, 0, 0]
+    t10 = K[pairs, j, 1] + p.Z[i, 1, 0]
+    t11 = K[pairs, j, 2] + p.Z[i, 1, 1]
+    v0, v1 = p.r[i, j, 0] - seen[pairs, j, 0], p.r[i, j, 1] - seen[pairs, j, 1]
     d2, cost = normal_cost(t00, t10, t11, v0, v1)
     return d2, cost - p.log_det_Z[i]
 
@@ -185,11 +126,14 @@ def pair_into(s: Work, p: Problem, pairs: int, i: int, j: int) -> None:
 
 
 @kernel
-def next_sighting(s: Work, p: Problem, pairs: int, cost_unpaired: float, cost_left: float, d2_left: float) -> int:
+def next_sighting(
+    s: Work, p: Problem, depth: int, cost_unpaired: float, cost_left: float, d2_left: float, must: int
+) -> int:
     """The open sighting to decide next: the one with the fewest candidates left, then the one with the cheapest.
 
     A pair whose own growth is cost_left or more, or more than d2_left, is in no hypothesis that counts. A sighting all
-    of whose pairs are such stays unpaired, which leaves less for the others. -1: this takes more than is left.
+    of whose pairs are such stays unpaired, which leaves less for the others. -1: this takes more than is left, or it is
+    the sighting that must be paired.
     """
     m, n = s.compatible.shape
     least, left = np.full(m, np.inf), np.zeros(m, np.int64)
@@ -197,7 +141,7 @@ def next_sighting(s: Work, p: Problem, pairs: int, cost_unpaired: float, cost_le
         if s.open[i] == 1:
             for j in range(n):
                 if s.compatible[i, j] == 1 and s.free[j] == 1:
-                    d2, cost = growth(s, p, pairs, i, j)
+                    d2, cost = growth(s.K, s.seen, p, s.pairs[depth], i, j)
                     if d2 <= d2_left and cost < cost_left:
                         left[i] += 1
                         least[i] = min(least[i], cost)
@@ -208,6 +152,8 @@ def next_sighting(s: Work, p: Problem, pairs: int, cost_unpaired: float, cost_le
             if s.open[i] == 1 and not least[i] < cost_left - before * cost_unpaired:
                 left[i] = 0
                 settled += 1
+                if i == must:
+                    return -1
         if settled > 0 and settled * cost_unpaired >= cost_left:
             return -1
     chosen = -1
@@ -218,21 +164,46 @@ def next_sighting(s: Work, p: Problem, pairs: int, cost_unpaired: float, cost_le
 
 
 @kernel
-def children_into(
-    s: Work, p: Problem, depth: int, pairs: int, i: int, cost_unpaired: float, cost_left: float, d2_left: float
-) -> int:
-    """What may become of sighting i, the cheapest first, and how many choices that are; UNPAIRED is one of them."""
+def open_level(s: Work, p: Problem, depth: int, levels: int, at: Limits, least: float, must: int) -> bool:
+    """Choose a sighting for this depth and what may become of it, UNPAIRED included. False: nothing can come of it."""
+    k = s.pairs[depth]
+    cost_left, d2_left = least - s.cost[depth], at.joint_gates[k + levels - depth] - s.d2[depth]
+    i = next_sighting(s, p, depth, at.cost_unpaired, cost_left, d2_left, must)
+    if i == -1:
+        return False
     count = 0
-    if cost_unpaired < cost_left:
-        insert_sorted(s.costs[depth], s.candidates[depth], 0, cost_unpaired, UNPAIRED)
+    if at.cost_unpaired < cost_left and i != must:
+        insert_sorted(s.costs[depth], s.candidates[depth], 0, at.cost_unpaired, UNPAIRED)
         count = 1
     for j in range(len(s.free)):
         if s.compatible[i, j] == 1 and s.free[j] == 1:
-            d2, cost = growth(s, p, pairs, i, j)
+            d2, cost = growth(s.K, s.seen, p, k, i, j)
             if cost < cost_left and d2 <= d2_left:
                 insert_sorted(s.costs[depth], s.candidates[depth], count, cost, j)
                 count += 1
-    return count
+    s.sighting[depth], s.choices[depth], s.turn[depth], s.open[i] = i, count, 0, 0
+    return True
+
+
+@kernel
+def descend(s: Work, p: Problem, depth: int, least: float) -> bool:
+    """Take back the last choice of this depth and make the next. False: there is none below `least`."""
+    i, k, turn = s.sighting[depth], s.pairs[depth], s.turn[depth]
+    if s.chosen[depth] >= 0:
+        s.free[s.chosen[depth]] = 1
+    s.chosen[depth] = UNPAIRED
+    if turn == s.choices[depth] or s.cost[depth] + s.costs[depth, turn] >= least:
+        s.open[i] = 1
+        return False
+    j = s.candidates[depth, turn]
+    s.turn[depth], s.chosen[depth] = turn + 1, j
+    s.cost[depth + 1] = s.cost[depth] + s.costs[depth, turn]
+    s.d2[depth + 1], s.pairs[depth + 1] = s.d2[depth], k
+    if j >= 0:
+        s.d2[depth + 1] += growth(s.K, s.seen, p, k, i, j)[0]
+        s.pairs[depth + 1], s.free[j] = k + 1, 0
+        pair_into(s, p, k, i, j)
+    return True
 
 
 @kernel
@@ -247,66 +218,69 @@ def insert_sorted(costs: Floats, values: Ints, count: int, cost: float, value: i
 
 @kernel
 def search(
-    p: Problem, gate: float, joint_gates: Floats, cost_unpaired: float, nodes_max: int
-) -> tuple[Ints, int, bool]:
-    """The hypothesis of least cost among those whose pairs pass `gate` and which pass the joint gate of their number.
+    p: Problem, at: Limits, nodes_max: int, must: int, barred: int, below: float
+) -> tuple[Ints, float, int, bool]:
+    """The hypothesis of least cost among those whose pairs pass the gate and which pass the joint gate of their number.
 
     Depth first, a sighting a level, its cheapest continuation first. A branch ends where its cost reaches the least
     found so far, or where it could not pass the joint gate even if all sightings left were paired at no distance.
 
-    joint_gates: limit of r' S^-1 r by number of pairs, ascending, shape (m + 1,).
     nodes_max: prefixes looked at after which the search ends, once it has been at the bottom; the best so far counts.
+    must, barred: where a rival is looked for, the sighting that must be paired, and the candidate that it may not
+    have; else -1. There only what costs less than `below` counts, and the bottom is not waited for.
 
-    Returns the assignment (m,), prefixes looked at, whether the search was cut short.
+    Returns the assignment (m,), its cost without what passes no gate (`below` where there is none), prefixes looked
+    at, whether the search was cut short.
     """
-    m = len(p.d2)
-    s = workspace(p, gate)
+    s = workspace(p, at.gate)
+    if must >= 0:
+        s.compatible[must, barred] = 0
     levels = len(places(s.open))
-    children, following = np.zeros(levels, np.int64), np.zeros(levels, np.int64)
-    sighting, chosen = np.full(levels, -1), np.full(levels, UNPAIRED)
-    cost, d2, pairs = np.zeros(levels + 1), np.zeros(levels + 1), np.zeros(levels + 1, np.int64)
-    best, least = np.full(m, UNPAIRED), levels * cost_unpaired
-    depth, nodes, bottom, opened = 0, 0, False, False
+    best, least = np.full(len(p.d2), UNPAIRED), below
+    if must == -1:
+        least = min(below, levels * at.cost_unpaired)
+    depth, nodes, bottom, opened = 0, 0, must >= 0, False
     while depth >= 0:
         if depth == levels:
             bottom = True
-            if cost[depth] < least and d2[depth] <= joint_gates[pairs[depth]]:
-                least = cost[depth]
+            if s.cost[depth] < least and s.d2[depth] <= at.joint_gates[s.pairs[depth]]:
+                least = s.cost[depth]
                 for level in range(levels):
-                    best[sighting[level]] = chosen[level]
+                    best[s.sighting[level]] = s.chosen[level]
             depth, opened = depth - 1, True
             continue
-        k = pairs[depth]
         if not opened:
             if bottom and nodes >= nodes_max:
-                return best, nodes, True
+                return best, least, nodes, True
             nodes += 1
-            cost_left, d2_left = least - cost[depth], joint_gates[k + levels - depth] - d2[depth]
-            i = next_sighting(s, p, k, cost_unpaired, cost_left, d2_left)
-            if i == -1:
-                depth, opened = depth - 1, True
-                continue
-            sighting[depth], following[depth] = i, 0
-            children[depth] = children_into(s, p, depth, k, i, cost_unpaired, cost_left, d2_left)
-            s.open[i] = 0
-        i = sighting[depth]
-        if chosen[depth] >= 0:
-            s.free[chosen[depth]] = 1
-        chosen[depth] = UNPAIRED
-        turn = following[depth]
-        if turn == children[depth] or cost[depth] + s.costs[depth, turn] >= least:
-            s.open[i] = 1
+            opened = open_level(s, p, depth, levels, at, least, must)
+        if opened and descend(s, p, depth, least):
+            depth, opened = depth + 1, False
+        else:
             depth, opened = depth - 1, True
-            continue
-        j = s.candidates[depth, turn]
-        following[depth] += 1
-        chosen[depth] = j
-        cost[depth + 1] = cost[depth] + s.costs[depth, turn]
-        d2[depth + 1], pairs[depth + 1] = d2[depth], k
-        if j >= 0:
-            d2[depth + 1] += growth(s, p, k, i, j)[0]
-            pairs[depth + 1] = k + 1
-            s.free[j] = 0
-            pair_into(s, p, k, i, j)
-        depth, opened = depth + 1, False
-    return best, nodes, False
+    return best, least, nodes, False
+
+
+@kernel
+def cost_of_rival(p: Problem, at: Limits, hypothesis: Ints, least: float) -> tuple[Floats, bool]:
+    """How much more the best hypothesis costs that gives a sighting to another candidate, and the rest to any, (m,).
+
+    Only what is below the ambiguity margin is looked for; infinite where there is nothing. least: the cost of the
+    hypothesis. All searches together look at nodes_max prefixes, each at its share of what is left of them; whether
+    one of them was cut short is returned, too.
+    """
+    m, n = p.d2.shape
+    more, contested = np.full(m, np.inf), np.zeros(m, np.int64)
+    for i in range(m):
+        for j in range(n):
+            if hypothesis[i] != UNPAIRED and j != hypothesis[i] and p.d2[i, j] <= at.gate:
+                contested[i] = 1
+    chosen, nodes_left, any_cut_short = places(contested), at.nodes_max, False
+    for k in range(len(chosen)):
+        i, share = chosen[k], nodes_left // (len(chosen) - k)
+        _, found, nodes, cut_short = search(p, at, share, i, hypothesis[i], least + at.ambiguity_margin)
+        nodes_left -= nodes
+        any_cut_short = any_cut_short or cut_short
+        if found < least + at.ambiguity_margin:
+            more[i] = found - least
+    return more, any_cut_short

@@ -9,7 +9,7 @@ Landmarks whose cells fall into the same bucket of the hash table form a list. N
 buckets. Cells of about the radius that is asked for are best: a query then touches 9 cells or fewer.
 
 Measured on a busy machine, one landmark a square metre, radius 3 m (28 found), 1,000 and 100,000 landmarks: a query
-along a drive 3.7 and 5.5 us, at places drawn at random 10 and 30 us (caches are cold); a move 5 us, twenty at once 9 us.
+along a drive 3.7 and 5.5 us, at places drawn at random 10 and 30 us (cold caches); a move 5 us, twenty at once 9 us.
 A dictionary of cells: 27 and 78 us a query. scipy's cKDTree: 17 to 27 and 17 to 34 us, built in 0.5 and 42 ms, and its
 means are those of when it was built: to be sure of what has moved since, one has to ask for a larger radius.
 """

@@ -24,7 +24,7 @@ from fleet_seif.records import Floats, Ints
 from tests.strategies import finite, settled, spd
 
 JOINT = AssociationSettings()
-LENIENT = AssociationSettings(ambiguity_margin=0.0)
+FREE = AssociationSettings(rivals="free")
 
 
 class Case(NamedTuple):
@@ -114,16 +114,15 @@ def test_pairs_pass_the_gate_and_no_candidate_has_two_sightings(case: Case, meth
     assert np.array_equal(found.assignment, np.where(found.verdict == PAIRED, found.hypothesis, -1))
 
 
-@given(cases(), st.sampled_from(METHODS), st.randoms(use_true_random=False))
+@given(cases(), st.sampled_from(METHODS), st.data())
 @settled
-def test_order_of_sightings_and_candidates_does_not_matter(case: Case, method: str, random: object) -> None:
+def test_order_of_sightings_and_candidates_does_not_matter(case: Case, method: str, data: st.DataObject) -> None:
     settings = AssociationSettings.model_validate({"method": method})
-    rng = np.random.default_rng(7)
     m, n = len(case.z), len(case.h)
     costs = sorted(allowed(case, settings).values())
     assume(method != "joint_compatibility" or len(costs) < 2 or costs[1] - costs[0] > 1e-6)
     assume(len({tuple(row) for row in case.z}) == m and len({tuple(row) for row in case.h}) == n)
-    of_z, of_h = rng.permutation(m), rng.permutation(n)
+    of_z, of_h = (np.array(data.draw(st.permutations(range(k))), np.int64) for k in (m, n))
     rows = (2 * of_h[:, None] + np.arange(2)).ravel()
     shuffled = associate(case.z[of_z], case.Z[of_z], case.h[of_h], case.C[np.ix_(rows, rows)].copy(), settings)
     plain = associate(*case, settings)
@@ -136,7 +135,7 @@ def test_order_of_sightings_and_candidates_does_not_matter(case: Case, method: s
 @given(cases(), st.sampled_from(METHODS))
 @settled
 def test_a_margin_is_what_the_best_change_to_a_free_candidate_costs(case: Case, method: str) -> None:
-    settings = AssociationSettings.model_validate({"method": method})
+    settings = AssociationSettings.model_validate({"method": method, "rivals": "free"})
     found = associate(*case, settings)
     hypothesis = tuple(found.hypothesis.tolist())
     now = cost_of(case, hypothesis, settings.cost_unpaired)[0]
@@ -158,7 +157,8 @@ class Scene(NamedTuple):
 
 
 def scene(
-    landmarks: Floats, error: Floats, pose_std: tuple[float, float, float], seen: list[int], spurious: Floats | None = None
+    landmarks: Floats, error: Floats, pose_std: tuple[float, float, float], seen: list[int],
+    spurious: Floats | None = None,
 ) -> Scene:  # fmt: skip
     """error: of the pose (0, 0, 0) that the vehicle believes in; spurious (k, 2): sightings of nothing in the map."""
     n = len(landmarks)
@@ -201,7 +201,7 @@ def test_where_the_heading_is_off_by_half_an_angle_between_landmarks_only_the_jo
 
 
 def test_a_spurious_sighting_stays_unpaired_though_it_is_close_to_a_candidate() -> None:
-    """By itself it is as good as anything, so wide is the pose; the other sightings leave no room for it."""
+    """By itself it is as good as anything, so vague is the pose; the other sightings leave no room for it."""
     places = np.array([[4.0, 0.0], [5.0, 2.0], [5.0, -2.0], [3.0, 1.5]])
     spurious = sight(RANGE_BEARING, np.zeros(3), np.array([3.2, 1.5]))[0][None]
     at = scene(places, np.array([0.3, -0.2, 0.05]), (0.4, 0.4, 0.1), [0, 1, 2], spurious)
@@ -220,6 +220,16 @@ def test_paying_for_what_is_unpaired_pairs_less_eagerly_than_counting_pairs() ->
     assert chosen(at, "joint_compatibility", cost_unpaired=100.0).tolist() == [0, 1]
 
 
+def test_the_joint_gate_is_asked_of_the_whole_hypothesis() -> None:
+    """Squared distances 3 and 0.5; the gates are 1.83 for one pair and 4.04 for two. The worse is decided first."""
+    z = np.array([[5.0 + 0.1 * np.sqrt(3.0), 0.0], [8.0, 0.1 * np.sqrt(0.5)]])
+    h = np.array([[5.0, 0.0], [8.0, 0.0], [8.0, 0.32]])
+    settings = AssociationSettings(joint_gate_probability=0.6, rivals="free")
+    found = associate(z, np.tile(0.01 * np.eye(2), (2, 1, 1)), h, np.zeros((6, 6)), settings)
+    assert found.hypothesis.tolist() == [0, 1]
+    assert found.squared_innovation == pytest.approx(3.5)
+
+
 def one_between_two(offset: float) -> Association:
     """A sighting between two candidates 0.2 m apart on a line of sight, `offset` m nearer to the first."""
     h = np.array([[5.0, 0.0], [5.2, 0.0]])
@@ -230,19 +240,50 @@ def one_between_two(offset: float) -> Association:
 def test_a_sighting_half_way_between_two_candidates_is_ambiguous_and_stays_unassigned() -> None:
     found = one_between_two(0.0)
     assert found.verdict.tolist() == [AMBIGUOUS]
-    assert found.hypothesis[0] >= 0 and found.assignment.tolist() == [-1]
+    assert found.hypothesis[0] >= 0
+    assert found.assignment.tolist() == [-1]
     assert found.margin[0] == pytest.approx(0.0, abs=1e-9)
     clear = one_between_two(0.15)
-    assert clear.verdict.tolist() == [PAIRED] and clear.assignment.tolist() == [0]
+    assert clear.verdict.tolist() == [PAIRED]
+    assert clear.assignment.tolist() == [0]
     assert clear.margin[0] == pytest.approx((0.25**2 - 0.05**2) / (0.1**2 + 1e-4))
 
 
-def test_two_sightings_between_two_candidates_take_one_each() -> None:
-    """No candidate is free, so there is no rival."""
+def test_two_sightings_that_could_change_places_are_ambiguous_among_joint_rivals_only() -> None:
+    """The other way round costs 2 (15^2 - 5^2) / (10^2 + 1) = 3.96 more, in cm; no candidate is free."""
     h = np.array([[5.0, 0.0], [5.2, 0.0]])
     z = np.array([[5.05, 0.0], [5.15, 0.0]])
-    found = associate(z, np.tile(np.diag([0.1**2, 0.1**2]), (2, 1, 1)), h, 1e-4 * np.eye(4), JOINT)
-    assert found.assignment.tolist() == [0, 1] and np.all(np.isinf(found.margin))
+    case = Case(z, np.tile(np.diag([0.1**2, 0.1**2]), (2, 1, 1)), h, 1e-4 * np.eye(4))
+    found = associate(*case, FREE)
+    assert found.assignment.tolist() == [0, 1]
+    assert np.all(np.isinf(found.margin))
+    found = associate(*case, JOINT)
+    assert found.hypothesis.tolist() == [0, 1]
+    assert found.verdict.tolist() == [AMBIGUOUS, AMBIGUOUS]
+    np.testing.assert_allclose(found.margin, 2.0 * (0.15**2 - 0.05**2) / (0.1**2 + 1e-4))
+
+
+def test_a_whole_row_that_could_be_shifted_by_one_is_ambiguous_among_joint_rivals_only() -> None:
+    """No sighting can go over alone: the others hold it. All together can, as well as not."""
+    row = np.array([[k - 3.0, 5.0] for k in range(7)])
+    at = scene(row, np.array([0.5, 0.0, 0.0]), (0.5, 0.05, 0.01), [2, 3, 4])
+    assert associate(*at.case, FREE).verdict.tolist() == [PAIRED] * 3
+    assert associate(*at.case, JOINT).verdict.tolist() == [AMBIGUOUS] * 3
+
+
+@given(cases())
+@settled
+def test_a_joint_rival_is_the_best_hypothesis_that_gives_the_sighting_to_another(case: Case) -> None:
+    found = associate(*case, JOINT)
+    free = associate(*case, FREE)
+    costs = allowed(case, JOINT)
+    for i, j in enumerate(found.hypothesis.tolist()):
+        others = [cost for hypothesis, cost in costs.items() if hypothesis[i] not in (-1, j)]
+        more = min(others, default=np.inf) - min(costs.values())
+        if j >= 0 and more < JOINT.ambiguity_margin:
+            assert found.margin[i] == pytest.approx(min(more, free.margin[i]), abs=1e-7)
+        else:
+            assert found.margin[i] == free.margin[i]
 
 
 def test_in_a_symmetric_scene_every_method_leaves_the_sighting_open() -> None:
@@ -302,8 +343,9 @@ def test_a_search_ends_at_its_limit_of_nodes_and_says_so() -> None:
     rng = np.random.default_rng(3)
     z, h = rng.normal(5.0, 0.05, (10, 2)), rng.normal(5.0, 0.05, (12, 2))
     case = Case(z, np.tile(0.01 * np.eye(2), (10, 1, 1)), h, 0.01 * np.eye(24))
-    found = associate(*case, LENIENT)
-    assert found.cut_short and found.pairs == 10
+    found = associate(*case, JOINT)
+    assert found.cut_short
+    assert found.pairs == 10
 
 
 def test_what_does_not_go_together_or_is_no_covariance_is_refused() -> None:
