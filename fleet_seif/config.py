@@ -28,6 +28,8 @@ class AssociationSettings(Settings):
     cost_unpaired: of leaving a sighting unpaired, in squared sigmas; -2 log of how many sightings of no landmark in the
     map there are per 2 pi standard deviations of sensor noise in range times bearing.
     ambiguity_margin: a pair is doubtful where another candidate costs less than this more.
+    rivals: what is compared: "free", candidates that no sighting is paired with, the rest staying as it is; "joint",
+    also any other hypothesis about the whole step. The latter is of joint_compatibility; the others know "free" only.
     birth_gate_probability: chance that a landmark's own sighting is within the gate in which none is born beside it.
     nodes_max: partial hypotheses looked at after which the best so far is taken, and again for all rivals together.
     confirm_sightings, confirm_steps: a new landmark is provisional until it has been sighted so many times within so
@@ -45,6 +47,7 @@ class AssociationSettings(Settings):
     joint_gate_probability: InnerProbability = 0.99
     cost_unpaired: Positive = 13.0
     ambiguity_margin: NotNegative = 5.0
+    rivals: Literal["free", "joint"] = "joint"
     birth_gate_probability: InnerProbability = 0.99999
     nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 500
     confirm_sightings: Annotated[int, Field(ge=1, le=100)] = 3
