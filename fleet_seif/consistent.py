@@ -133,7 +133,7 @@ def grown(c: Candidates, seed: int, gate: float) -> Found:
 
 
 def agreeing(c: Candidates, place: Floats, gate: float) -> Bools:
-    """Which candidates agree pairwise, (m, m): one life gets no landmark twice, and distances are the same in both maps.
+    """Which candidates agree pairwise, (m, m): no landmark twice of one life, and distances are the same in both maps.
 
     With n the direction from candidate i to k (place (m, 2): where they are), the difference between the two maps'
     distances is n'(D_k - D_i), whose variance is n'(S_ii + S_kk - S_ik - S_ki) n.
@@ -152,7 +152,7 @@ def agreeing(c: Candidates, place: Floats, gate: float) -> Bools:
         for two, two_other in ((a, b), (b, a)):
             rivals = np.any(c.has[one_other][:, None] & c.has[two_other][None], axis=2)
             fits &= ~((one[:, None] == two[None]) & rivals)
-    return fits & ~np.eye(m, dtype=bool)
+    return np.asarray(fits & ~np.eye(m, dtype=bool))
 
 
 def largest_clique(fits: Bools, budget: int = CLIQUE_BUDGET) -> Ints:

@@ -8,11 +8,12 @@ and forward substitution alone touches only the nodes where something of G is el
 a few variables that lie near each other cost a path to the root, however large the map is.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 
 from fleet_seif.joint_records import JointSolution
 from fleet_seif.joint_tree import Tree
@@ -23,7 +24,7 @@ TOGETHER_MAX: Final = 64
 
 
 def halved(points: Floats, most: int) -> Iterator[Ints]:
-    """Points (n, 2) in groups of at most `most` that lie together: halved along the longer side while there are more."""
+    """Points (n, 2) in groups of at most `most` that lie together: halved along the longer side as often as needed."""
     waiting = [np.arange(len(points))]
     while waiting:
         group = waiting.pop()
@@ -36,6 +37,9 @@ def halved(points: Floats, most: int) -> Iterator[Ints]:
         waiting += [order[len(order) // 2 :], order[: len(order) // 2]]
 
 
+_blas = scipy.linalg.blas
+
+
 class JointCovariance:
     """Covariances of one solution, linearised at its mean, robust weights included."""
 
@@ -45,6 +49,13 @@ class JointCovariance:
         self._tree.know(system.size.tolist())
         self._tree.add(system.pieces)
         self._tree.factor(system.frames, system.at)
+        self._nodes = self._tree.nodes()
+        self._home = np.full(len(system.size), -1)
+        for k, node in enumerate(self._nodes):
+            self._home[node.variables[: node.eliminated]] = k
+        number = {node: k for k, node in enumerate(self._nodes)}
+        self._above = [-1 if node.parent is None else number[node.parent] for node in self._nodes]
+        self._place = np.zeros(3 * len(system.size), np.int64)
         self._variable = system.variable
         self._mean = solution.landmark_mean
 
@@ -52,27 +63,34 @@ class JointCovariance:
         """The marginal of every landmark, m^2, shape (n, 2, 2)."""
         return self._tree.inverse_blocks()[self._variable[: len(self._mean)], :2, :2]
 
-    def whitened(self, G: Floats) -> Floats:
+    def whitened(self, G: scipy.sparse.coo_array) -> Floats:
         """Y (r, c) with Y'Y = G' H^-1 G, for c linear functions G (3 v, c) of the state (three rows a variable)."""
-        g, touched, found = G.copy(), np.any(G, axis=1), []
-        for node in self._tree.nodes():
-            e, rows = len(node.D), node.rows
-            if not e or not np.any(touched[rows[:e]]):
-                continue
-            y = scipy.linalg.solve_triangular(node.D, g[rows[:e]], trans=1, check_finite=False)
-            found.append(y)
-            if len(rows) > e:
-                g[rows[e:]] -= node.W.T @ y
-                touched[rows[e:]] = True
-        return np.concatenate([*found, np.empty((0, G.shape[1]))])
+        path: set[int] = set()
+        for k in np.unique(self._home[G.row // 3]).tolist():
+            while k >= 0 and k not in path:
+                path.add(k)
+                k = self._above[k]
+        nodes = [self._nodes[k] for k in sorted(path)]
+        rows = np.concatenate([*(node.rows[: len(node.D)] for node in nodes), np.empty(0, np.int64)])
+        self._place[rows] = np.arange(len(rows))
+        g, at = np.zeros((len(rows), G.shape[1])), 0
+        np.add.at(g, (self._place[G.row], G.col), G.data)
+        for node in nodes:
+            e = len(node.D)
+            if e:
+                g[at : at + e] = y = _blas.dtrsm(1.0, node.D.T, g[at : at + e], lower=1)
+                if len(node.rows) > e:
+                    g[self._place[node.rows[e:]]] -= node.W.T @ y
+            at += e
+        return g
 
     def differences(self, pairs: Ints) -> Floats:
         """The joint covariance of the differences y_a - y_b of pairs (m, 2) of landmarks, m^2, shape (2 m, 2 m)."""
-        G = np.zeros((3 * len(self._tree.size), 2 * len(pairs)))
-        columns = 2 * np.arange(len(pairs))
-        for end, sign in ((0, 1.0), (1, -1.0)):
-            for axis in range(2):
-                G[3 * self._variable[pairs[:, end]] + axis, columns + axis] += sign
+        m = len(pairs)
+        rows = 3 * self._variable[pairs.T.ravel()][:, None] + np.arange(2)
+        cols = np.tile(np.arange(2 * m).reshape(m, 2), (2, 1))
+        sign = np.repeat([1.0, -1.0], 2 * m)
+        G = scipy.sparse.coo_array((sign, (rows.ravel(), cols.ravel())), shape=(3 * len(self._tree.size), 2 * m))
         Y = self.whitened(G)
         return np.asarray(Y.T @ Y)
 
@@ -94,5 +112,3 @@ def diagonal_blocks(S: Floats) -> Floats:
 def squared_distances(d: Floats, S: Floats) -> Floats:
     """d' S^-1 d of each d (m, 2) with its covariance S (m, 2, 2), shape (m,)."""
     return np.asarray(np.einsum("mi,mi->m", d, np.linalg.solve(S, d[..., None])[..., 0]))
-
-

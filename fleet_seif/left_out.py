@@ -59,7 +59,7 @@ def left_out(solution: JointSolution, parts: Classes, covariance: JointCovarianc
     for some in halved(place, TOGETHER_MAX):
         columns = (3 * split.own[some, None] + np.arange(2)).ravel()
         own = H[:, columns]
-        Y = covariance.whitened((fold.T @ own).toarray())
+        Y = covariance.whitened((fold.T @ own).tocoo())
         rows = own[columns].toarray()
         information = diagonal_blocks(rows) - diagonal_blocks(Y.T @ Y)
         S[some] = np.linalg.inv((information + information.transpose(0, 2, 1)) / 2)

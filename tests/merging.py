@@ -1,4 +1,4 @@
-"""Merging by place alone, scored by signatures: python -m tests.merging --scenario three_air_vehicles_mild --seeds 1..20.
+"""Merging by place alone, scored by signatures: python -m tests.merging --scenario NAME --seeds 1..20 [--set T.K=V].
 
 Vehicles map with signatures, so each vehicle's own map is associated as it should be. Then the signatures are taken
 away, and what the fleet finds to be one is compared with what they say.
