@@ -512,7 +512,7 @@ class Ledger:
         return tuple(_contribution(stream, live and id(stream.life) not in stuck) for stream in self.placed())
 
     def classes(self, lives: Sequence[Life]) -> tuple[tuple[LandmarkName, ...], ...]:
-        """Which landmarks are the same, by signature and by what operators have decided."""
+        """Which landmarks are the same, by signatures, aliases and what operators have decided."""
         return landmark_classes(lives, self.decisions.forced, self.decisions.forbidden)
 
     def ledger_digest(self) -> bytes:
@@ -558,13 +558,14 @@ def _contribution(stream: Stream, live: bool) -> Life:
     life = stream.life
     assert life is not None
     assert life.hello is not None
-    checked = life.checked
-    frames = {n: f.total.delta() for n, f in life.frames.items()} if live else checked.frames
+    held = life.newest if live else life.checked
     return Life(
         vehicle=stream.vehicle,
         life=stream.number,
         start_pose=np.asarray(life.hello.start_pose),
         start_pose_cov=np.asarray(life.hello.start_pose_cov),
-        frames=tuple(frames[number] for number in sorted(frames)),
-        signatures=tuple(life.signatures[: None if live else checked.names]),
+        frames=tuple(held.frames[number] for number in sorted(held.frames)),
+        signatures=tuple(life.signatures[: held.names]),
+        aliases=held.aliases,
+        consistent=held.consistent,
     )
