@@ -20,7 +20,6 @@ from fleet_seif.messages import DeltaMessage, FramePart, FrameStatus, Hello
 from fleet_seif.records import Floats
 from fleet_seif.streams import is_check_point
 
-
 INNOVATION_MAX: Final = 1.5
 """Mean squared normalised innovation, per degree of freedom, up to which a vehicle counts as consistent."""
 INNOVATION_SIGMAS: Final = 5.0
