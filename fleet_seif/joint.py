@@ -47,40 +47,57 @@ def landmark_names(life: Life) -> list[LandmarkName]:
     return [LandmarkName(life.vehicle, life.life, number) for number in numbers]
 
 
-def landmark_classes(lives: Sequence[Life], forced: Sequence[Pair] = (), forbidden: Sequence[Pair] = ()) -> Classes:
-    """Which landmarks are the same: those that carry one signature. In canonical order of their first names.
+def landmark_classes(
+    lives: Sequence[Life],
+    forced: Sequence[Pair] = (),
+    forbidden: Sequence[Pair] = (),
+    merged: Sequence[Pair] = (),
+) -> Classes:
+    """Which landmarks are the same: those that carry one signature, and aliases. In order of their first names.
 
     Landmarks whose rows are all zero in every frame are none and do not appear.
 
     Args:
         forced: pairs that are one landmark whatever they carry, joined first and in this order.
         forbidden: pairs that are two: what would join them, a forced pair too, does nothing.
+        merged: pairs that were found to be one, joined last, but for those that would give a life another name.
     """
     groups: dict[object, list[LandmarkName]] = {}
     names: list[LandmarkName] = []
+    aliases: list[Pair] = []
     for life in lives:
         for name in landmark_names(life):
             names.append(name)
             signature = life.signatures[name.number]
             groups.setdefault(name if signature == UNKNOWN_SIGNATURE else signature, []).append(name)
-    if forced or forbidden:
+        aliases += [
+            (LandmarkName(life.vehicle, life.life, a), LandmarkName(life.vehicle, life.life, b))
+            for a, b in life.aliases
+        ]
+    if forced or forbidden or aliases or merged:
         same = [(group[0], other) for group in map(sorted, groups.values()) for other in group[1:]]
-        return _joined(names, [*forced, *sorted(same)], forbidden)
+        return _joined(names, [*forced, *sorted([*same, *aliases])], forbidden, merged)
     return tuple(sorted(tuple(sorted(group)) for group in groups.values()))
 
 
-def _joined(names: Sequence[LandmarkName], pairs: Sequence[Pair], forbidden: Sequence[Pair]) -> Classes:
-    """Classes of names: pairs are joined in order, but for those that would put a forbidden pair into one class."""
+def _joined(
+    names: Sequence[LandmarkName], pairs: Sequence[Pair], forbidden: Sequence[Pair], merged: Sequence[Pair]
+) -> Classes:
+    """Classes of names: pairs are joined in order, but for those that would put a forbidden pair into one class, then
+    those merged, but for those that would put two names of one life into one class, too."""
     classes = {name: {name} for name in names}
     apart: dict[LandmarkName, set[LandmarkName]] = {}
     for a, b in forbidden:
         apart.setdefault(a, set()).add(b)
         apart.setdefault(b, set()).add(a)
-    for a, b in pairs:
+    decided = len(pairs)
+    for i, (a, b) in enumerate([*pairs, *merged]):
         if a not in classes or b not in classes or classes[a] is classes[b]:
             continue
         one, other = classes[a], classes[b]
         if any(not apart[name].isdisjoint(other) for name in one & apart.keys()):
+            continue
+        if i >= decided and not {name[:2] for name in one}.isdisjoint(name[:2] for name in other):
             continue
         one |= other
         for name in other:

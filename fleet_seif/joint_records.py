@@ -19,7 +19,11 @@ Classes = tuple[tuple[LandmarkName, ...], ...]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Life:
-    """What one life of a vehicle has contributed: cumulative deltas of frames 0, 1, ...; signatures by number."""
+    """What one life of a vehicle has contributed: cumulative deltas of frames 0, 1, ...; signatures by number.
+
+    aliases: pairs of its own landmarks that are one. consistent: whether its sightings fit as well as it says; if not,
+    its landmarks are not merged with others by their place.
+    """
 
     vehicle: str
     life: int
@@ -27,17 +31,20 @@ class Life:
     start_pose_cov: Floats
     frames: tuple[FrameDelta, ...]
     signatures: tuple[int, ...]
+    aliases: tuple[tuple[int, int], ...] = ()
+    consistent: bool = True
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class System:
     """What a solution was made from, by joint variables (fleet_seif.joint_frames).
 
-    at: what frames say at the mean. variable: the joint variables in the order of the solution's rows. size (v,): rows
-    of each joint variable.
+    keys: (vehicle, life, frame) of each frame, None where there is none. at: what frames say at the mean. variable: the
+    joint variables in the order of the solution's rows. size (v,): rows of each joint variable.
     """
 
     frames: Frames
+    keys: tuple[tuple[str, int, int] | None, ...]
     pieces: tuple[Piece, ...]
     at: Evaluation
     variable: Ints

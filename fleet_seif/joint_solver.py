@@ -175,6 +175,7 @@ def _solution(estimate: Estimate, at: Evaluation, lives: Sequence[Life], classes
         dof=(registry.frames.end_row - registry.frames.first_row)[chosen],
         system=System(
             frames=registry.frames,
+            keys=tuple(registry.keys),
             pieces=tuple(estimate.tree.pieces.values()),
             at=at,
             variable=variables,

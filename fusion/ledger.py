@@ -24,6 +24,7 @@ from fleet_seif.envelope import KIND_SNAPSHOT, authenticate, body_digest, kind_o
 from fleet_seif.errors import WireError
 from fleet_seif.information import delta_digest
 from fleet_seif.joint import Life, landmark_classes
+from fleet_seif.joint_records import Classes
 from fleet_seif.messages import Action, DeltaMessage, Epoch, Evidence, LandmarkName, OperatorEvent, Snapshot
 from fleet_seif.node_wire import EVENTS_MAX, STREAMS_MAX, decode_event, decode_evidence, encode_event, encode_evidence
 from fleet_seif.signing import KeyRing, Role, Signer
@@ -511,8 +512,8 @@ class Ledger:
         stuck = {id(s.life) for s in self.streams.values() if s.quarantine}
         return tuple(_contribution(stream, live and id(stream.life) not in stuck) for stream in self.placed())
 
-    def classes(self, lives: Sequence[Life]) -> tuple[tuple[LandmarkName, ...], ...]:
-        """Which landmarks are the same, by signature and by what operators have decided."""
+    def classes(self, lives: Sequence[Life]) -> Classes:
+        """Which landmarks are the same, by signatures, aliases and what operators have decided."""
         return landmark_classes(lives, self.decisions.forced, self.decisions.forbidden)
 
     def ledger_digest(self) -> bytes:
@@ -526,18 +527,28 @@ class Ledger:
         digest.update(self.events_digest())
         return digest.digest()
 
-    def map_digest(self) -> bytes:
-        """32 bytes that identify what the canonical map is assembled from; no epoch's nonce enters."""
-        digest = hashlib.blake2b(digest_size=32)
+    def map_digest(self, classes: Classes | None = None) -> bytes:
+        """32 bytes that identify what the canonical map is assembled from; see `digest_of`.
+
+        Args:
+            classes: with all merges (see fusion.merges); by default those that need no solution, which are all there
+                are where every landmark carries a signature.
+        """
         lives = self.lives()
-        for life in lives:
-            digest.update(f"{life.vehicle} {life.life} ".encode())
-            digest.update(life.start_pose.tobytes() + life.start_pose_cov.tobytes())
-            for frame, total in enumerate(life.frames):
-                if len(total.variables):
-                    digest.update(frame.to_bytes(8, "little") + delta_digest(total))
-        digest.update(repr([[tuple(name) for name in group] for group in self.classes(lives)]).encode())
-        return digest.digest()
+        return digest_of(lives, self.classes(lives) if classes is None else classes)
+
+
+def digest_of(lives: Sequence[Life], classes: Classes) -> bytes:
+    """32 bytes that identify what a map is assembled from; no epoch's nonce enters."""
+    digest = hashlib.blake2b(digest_size=32)
+    for life in lives:
+        digest.update(f"{life.vehicle} {life.life} ".encode())
+        digest.update(life.start_pose.tobytes() + life.start_pose_cov.tobytes())
+        for frame, total in enumerate(life.frames):
+            if len(total.variables):
+                digest.update(frame.to_bytes(8, "little") + delta_digest(total))
+    digest.update(repr([[tuple(name) for name in group] for group in classes]).encode())
+    return digest.digest()
 
 
 def _hello_of(stream: Stream) -> bytes | None:
@@ -558,13 +569,14 @@ def _contribution(stream: Stream, live: bool) -> Life:
     life = stream.life
     assert life is not None
     assert life.hello is not None
-    checked = life.checked
-    frames = {n: f.total.delta() for n, f in life.frames.items()} if live else checked.frames
+    held = life.newest if live else life.checked
     return Life(
         vehicle=stream.vehicle,
         life=stream.number,
         start_pose=np.asarray(life.hello.start_pose),
         start_pose_cov=np.asarray(life.hello.start_pose_cov),
-        frames=tuple(frames[number] for number in sorted(frames)),
-        signatures=tuple(life.signatures[: None if live else checked.names]),
+        frames=tuple(held.frames[number] for number in sorted(held.frames)),
+        signatures=tuple(life.signatures[: held.names]),
+        aliases=held.aliases,
+        consistent=held.consistent,
     )

@@ -5,9 +5,13 @@
 3. At every check point the frames that changed must be positive definite. What was so is `checked`; canonical maps rest
    on that alone, so a life that has ended with a reason stays at its last check.
 4. The verdict is a function of the messages, whoever folds them and whenever.
+5. An alias counts until it is taken back. Innovations are summed by epoch, in order: a snapshot of an epoch's prefix
+   brings the same bits as its messages.
 """
 
+import math
 from dataclasses import dataclass, field
+from typing import Final
 
 from fleet_seif.definite import is_positive_definite
 from fleet_seif.errors import NumericalError
@@ -15,6 +19,11 @@ from fleet_seif.information import H_QUANTUM, FrameDelta, FrameTotal, largest_gr
 from fleet_seif.messages import DeltaMessage, FramePart, FrameStatus, Hello
 from fleet_seif.records import Floats
 from fleet_seif.streams import is_check_point
+
+INNOVATION_MAX: Final = 1.5
+"""Mean squared normalised innovation, per degree of freedom, up to which a vehicle counts as consistent."""
+INNOVATION_SIGMAS: Final = 5.0
+"""What is added for chance: so many standard deviations of a chi-square."""
 
 
 @dataclass
@@ -27,11 +36,21 @@ class Frame:
 
 @dataclass(frozen=True)
 class Checked:
-    """What a life had contributed at its last check point. frames: by number; names: how many landmarks."""
+    """What a life had contributed at its last check point. frames: by number; names: how many landmarks; aliases: pairs
+    of them that are one, ascending; innovation, dof: sum of squared normalised innovations, its degrees of freedom."""
 
     frames: dict[int, FrameDelta] = field(default_factory=dict)
     names: int = 0
     healthy: bool = True
+    aliases: tuple[tuple[int, int], ...] = ()
+    innovation: float = 0.0
+    dof: int = 0
+
+    @property
+    def consistent(self) -> bool:
+        """Whether innovations are, on the whole, about as large as the vehicle says that they should be."""
+        allowed = INNOVATION_MAX * self.dof + INNOVATION_SIGMAS * math.sqrt(2.0 * self.dof)
+        return self.innovation <= allowed
 
 
 class LifeTotal:
@@ -43,12 +62,25 @@ class LifeTotal:
         self.signatures: list[int] = []
         self.healthy = True
         self.checked = Checked()
+        self._aliases: set[tuple[int, int]] = set()
+        self._innovation: list[float] = []
+        self._dof = 0
         self._changed: set[int] = set()
         self._ended: set[int] = set()
 
     @property
     def number(self) -> int:
         return 0 if self.hello is None else self.hello.life
+
+    @property
+    def newest(self) -> Checked:
+        """All that has been folded, as if it had been checked."""
+        frames = {number: frame.total.delta() for number, frame in self.frames.items()}
+        return self._as_checked(frames)
+
+    def _as_checked(self, frames: dict[int, FrameDelta]) -> Checked:
+        aliases = tuple(sorted(self._aliases))
+        return Checked(frames, len(self.signatures), self.healthy, aliases, sum(self._innovation), self._dof)
 
     def fold(self, message: DeltaMessage, *, check: bool = False) -> str | None:
         """Add the next message, and check the sum at a check point or where told to.
@@ -62,6 +94,12 @@ class LifeTotal:
             self.hello = message.hello
         self.signatures.extend(signature for _, signature in message.landmarks)
         self.healthy = message.healthy
+        for a, b, added in message.aliases:
+            (self._aliases.add if added else self._aliases.discard)((min(a, b), max(a, b)))
+        if message.hello is not None:
+            self._innovation.append(0.0)
+        self._innovation[-1] += message.innovation
+        self._dof += message.innovation_dof
         if check or is_check_point(message):
             reason = self._check()
         return None if reason is None else f"message {message.last}: {reason}"
@@ -129,7 +167,7 @@ class LifeTotal:
             if not definite:
                 return f"the information in frame {number} is not positive definite"
         self._changed.clear()
-        self.checked = Checked(frames, len(self.signatures), self.healthy)
+        self.checked = self._as_checked(frames)
         return None
 
 

@@ -10,16 +10,26 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleet_seif.errors import NumericalError
-from fleet_seif.joint import JointSolution, JointSolver, Life, marginal_covariances, solve
+from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes, marginal_covariances, solve
 from fleet_seif.joint_records import Classes
+from fleet_seif.merging import Merges
 from fleet_seif.messages import JointMap, VehicleState
 from fleet_seif.records import Floats
 from fusion.core import FusionCore
+from fusion.events import Decisions
+from fusion.ledger import digest_of
+from fusion.merges import Merger
 
 LEFT_OUT = "lives_left_out"
 WEIGHTED_DOWN = "frames_weighted_down"
+CANDIDATES = "merge_candidates"
+REFUSED = "merges_refused"
+OF_MAPS = (LEFT_OUT, WEIGHTED_DOWN, CANDIDATES, REFUSED)
+"""Counters that a map adds to those of its node."""
 COVARIANCE_PAUSE = 4.0
 """Time between two computations of covariances, in the time that one takes."""
+MERGE_PAUSE = 4.0
+"""Time between two searches for merges, in the time that one takes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,10 +39,8 @@ class MapInput:
     fleet: str
     node: str
     checked: tuple[Life, ...]
-    classes: Classes
     live: tuple[Life, ...] | None
-    live_classes: Classes
-    map_digest: bytes
+    decisions: Decisions
     ledger_digest: bytes
     vehicles: tuple[VehicleState, ...]
     counters: dict[str, int]
@@ -59,10 +67,8 @@ def map_input(core: FusionCore, now_s: float) -> MapInput:
         fleet=ledger.fleet,
         node=core.node,
         checked=checked,
-        classes=ledger.classes(checked),
         live=None if same else live,
-        live_classes=() if same else ledger.classes(live),
-        map_digest=ledger.map_digest(),
+        decisions=ledger.decisions,
         ledger_digest=ledger.ledger_digest(),
         vehicles=core.states(now_s),
         counters=dict(core.counters),
@@ -77,12 +83,18 @@ class MapMaker:
     2. Covariances have a cadence of their own, a fifth of the time: `with_covariances` adds them to a map that has been
        served already. Maps in between carry the last ones as long as they have the same landmarks, with the version
        they belong to. The first map and a final one have their own.
+    3. So have merges: `look_for_merges` finds those of all that has been folded, from nothing. Maps in between keep the
+       last ones, with what is new unmerged; a canonical map has its own.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._solver = JointSolver()
         self._covariances = Covariances()
+        self._merger = Merger()
+        self._merges = Merges(())
+        self._merges_due_s = -math.inf
+        self._taken: MapInput | None = None
         self._is_first = True
         self._solution: JointSolution | None = None
         self.replay_s = 0.0
@@ -93,30 +105,53 @@ class MapMaker:
 
         Raises NumericalError where nothing can be solved.
         """
+        self._taken = taken
         canonical = taken.live is None or final
         if taken.live is not None and not final:
             try:
-                return self._solved(taken, taken.live, taken.live_classes, version, final=False, canonical=False)
+                classes = self._with_merges(taken.live, taken.decisions)
+                return self._solved(taken, taken.live, classes, version, final=False, canonical=False)
             except NumericalError:
                 canonical = replay = True
         canonical = canonical and (replay or final or self._is_first)
+        if canonical:
+            self._merges = self._merger.of(taken.checked, taken.decisions)
+        classes = self._with_merges(taken.checked, taken.decisions)
         try:
-            return self._solved(taken, taken.checked, taken.classes, version, final=final, canonical=canonical)
+            return self._solved(taken, taken.checked, classes, version, final=final, canonical=canonical)
         except NumericalError:
             # each positive definite, and yet too lopsided or contradictory to be solved: nobody takes the map from all
-            good = _that_can_be_solved(taken.checked, taken.classes)
+            good = _that_can_be_solved(taken.checked, classes)
             taken = dataclasses.replace(taken, counters={**taken.counters, LEFT_OUT: len(taken.checked) - len(good)})
-            kept = _classes_of(good, taken.classes)
-            return self._solved(taken, good, kept, version, final=final, canonical=canonical)
+            return self._solved(taken, good, _classes_of(good, classes), version, final=final, canonical=canonical)
+
+    def _with_merges(self, lives: tuple[Life, ...], decisions: Decisions) -> Classes:
+        """The classes of lives with the merges that were found last: all of them, where they were found for these."""
+        return landmark_classes(lives, decisions.forced, decisions.forbidden, self._merges.pairs)
+
+    def look_for_merges(self) -> bool:
+        """Find the merges of what the last map was made from, where that is due; whether they differ from the last."""
+        taken = self._taken
+        if taken is None or self._clock() < self._merges_due_s:
+            return False
+        lives, before = taken.checked if taken.live is None else taken.live, self._merges.pairs
+        if self._merger.knows(lives, taken.decisions):
+            return False
+        begin = self._clock()
+        self._merges = self._merger.of(lives, taken.decisions)
+        now_s = self._clock()
+        self._merges_due_s = now_s + MERGE_PAUSE * (now_s - begin)
+        return self._merges.pairs != before
 
     def _solved(
         self, taken: MapInput, lives: tuple[Life, ...], classes: Classes, version: int, *, final: bool, canonical: bool
     ) -> JointMap:
         self._solution = None
+        map_digest = digest_of(taken.checked, self._with_merges(taken.checked, taken.decisions))
         if not lives:  # nothing yet, but who has been heard and what has been counted
             return dataclasses.replace(
                 empty_map(taken.fleet, taken.node, version), canonical=canonical, final=final,
-                map_digest=taken.map_digest, ledger_digest=taken.ledger_digest, vehicles=taken.vehicles,
+                map_digest=map_digest, ledger_digest=taken.ledger_digest, vehicles=taken.vehicles,
                 counters=taken.counters,
             )  # fmt: skip
         begin = self._clock()
@@ -125,7 +160,12 @@ class MapMaker:
             self.replay_s = self._clock() - begin
         newest = _newest(solution)
         rows = list(newest.values())
-        covariances, doubtful = self._covariances, len(solution.doubtful)
+        covariances = self._covariances
+        counted = {
+            WEIGHTED_DOWN: len(solution.doubtful),
+            CANDIDATES: len(self._merges.considered),
+            REFUSED: len(self._merges.refused),
+        }
         if (covariances.classes, covariances.poses) != (classes, tuple(newest)):
             covariances = Covariances()
         made = JointMap(
@@ -134,7 +174,7 @@ class MapMaker:
             version=version,
             canonical=canonical,
             final=final,
-            map_digest=taken.map_digest,
+            map_digest=map_digest,
             ledger_digest=taken.ledger_digest,
             landmark_mean=solution.landmark_mean,
             landmark_cov=covariances.landmark_cov,
@@ -145,7 +185,7 @@ class MapMaker:
             pose_mean=solution.pose_mean[rows],
             pose_cov=covariances.pose_cov,
             vehicles=taken.vehicles,
-            counters={**taken.counters, WEIGHTED_DOWN: doubtful} if doubtful else taken.counters,
+            counters={**taken.counters, **{name: n for name, n in counted.items() if n}},
         )
         self._solution, is_first, self._is_first = solution, self._is_first, False
         return self.with_covariances(made, version) if final or is_first else made

@@ -28,7 +28,7 @@ from fleet_seif.store import Put, Store, StoreError
 from fusion import records
 from fusion.core import AskEvents, AskRange, Effect, FusionCore, PutAck, PutStatus
 from fusion.inbox import Inbox
-from fusion.mapping import LEFT_OUT, WEIGHTED_DOWN, MapMaker, empty_map, map_input
+from fusion.mapping import OF_MAPS, MapMaker, empty_map, map_input
 
 log = logging.getLogger(__name__)
 BURST_MAX = 256
@@ -246,10 +246,12 @@ class FusionService:
                 with self._lock:
                     stalled = [state.stalled for state in self._core.states(self._clock())]
                 old = self.newest
-                counted = {name: n for name, n in old.counters.items() if name not in (LEFT_OUT, WEIGHTED_DOWN)}
+                counted = {name: n for name, n in old.counters.items() if name not in OF_MAPS}
                 news = stalled != [state.stalled for state in old.vehicles] or self._core.counters != counted
                 if self._core.changed or news or not self._served:
                     self._serve(final=False)
+                    if self._maker.look_for_merges():
+                        self._serve(final=False)
                     quiet_since_s = self._clock()
                     if self._maker.are_covariances_due:
                         self._publish_map(self._maker.with_covariances(self.newest, self.newest.version + 1))

@@ -24,6 +24,7 @@ from fleet_seif.store import Put
 from fleet_seif.warm_up import warm_up
 from fusion import records
 from fusion.core import FusionCore
+from fusion.merges import run_digest
 from fusion.service import FusionService, restore
 from scenarios import output
 from scenarios.config import Scenario
@@ -204,7 +205,7 @@ def run_fusion(
             service.run(_teller(say, settings, expected, clock))
             if place.result is not None:
                 _write_fusion(place.result / f"{name}.json", core, service)
-    say({"event": "done", "digest": core.ledger.map_digest().hex()})
+    say({"event": "done", "digest": run_digest(core.ledger).hex()})
 
 
 @contextlib.contextmanager
@@ -256,7 +257,7 @@ def _teller(
 
 def _write_fusion(path: Path, core: FusionCore, service: FusionService) -> None:
     facts = {
-        "digest": core.ledger.map_digest().hex(),
+        "digest": run_digest(core.ledger).hex(),
         "streams": output.stream_facts(core, time.monotonic()),
         "fusion": {
             "maps_served": service.statistics.maps,

@@ -18,6 +18,7 @@ from rich.text import Text
 
 from fleet_seif.joint import marginal_chi_square, solve
 from fleet_seif.records import Floats
+from fusion.merges import merges_of
 from scenarios import output
 from scenarios.association import associate, fleet_association, majority_truth
 from scenarios.batch import BatchSolution, solve_batch
@@ -116,8 +117,7 @@ def pose_errors(poses: Sequence[Floats], truth: Sequence[Floats]) -> PoseErrors:
 
 def fused_map(run: FinishedRun) -> MapEstimate:
     """The canonical map of a run."""
-    lives = run.ledger.lives()
-    solution = solve(lives, run.ledger.classes(lives))
+    solution = solve(run.ledger.lives(), merges_of(run.ledger).classes)
     truth = landmark_truths(solution, run.truths)
     return MapEstimate(mean=solution.landmark_mean, truth=truth, H=solution.H)
 

@@ -12,6 +12,7 @@ from fleet_seif.messages import FrameStatus
 from fleet_seif.records import Floats
 from fleet_seif.wire import decode_message
 from fusion.ledger import Ledger
+from fusion.merges import Merger
 from scenarios.recording import Log, Recording
 
 
@@ -49,13 +50,13 @@ def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
         ),
         key=lambda item: item[:2],
     )
-    at, solver = 0, JointSolver()
+    at, solver, merger = 0, JointSolver(), Merger()
     for time_s in times_s:
         while at < len(waiting) and waiting[at][0] <= time_s:
             again.accept(waiting[at][2])
             at += 1
         lives = again.lives(live=True)
-        classes = again.classes(lives)
+        classes = merger.of(lives, again.decisions).classes
         if not classes:
             continue
         try:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_seif.errors import RunError
+from fusion.merges import run_digest
 from scenarios import output
 from scenarios.config import Scenario
 from scenarios.faults import Fault
@@ -288,7 +289,7 @@ def run_processes(
             fusion=facts[0]["fusion"],
         )
     for node, fact in zip(nodes, facts, strict=True):
-        if finished.ledger.map_digest().hex() != fact["digest"]:
+        if run_digest(finished.ledger).hex() != fact["digest"]:
             raise RunError(f"{node} had another map at the end than its ledger gives now: please report this")
     return finished
 

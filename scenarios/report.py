@@ -1,5 +1,6 @@
 """From a finished run to its report and the files in its folder."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -8,8 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from fleet_seif.joint import JointSolution, marginal_covariances, solve
+from fleet_seif.merging import Merges
 from fleet_seif.records import Floats
 from fusion.ledger import Ledger
+from fusion.merges import merges_of
 from scenarios import output
 from scenarios.association import Truths, assigned_truth, associate, fleet_association
 from scenarios.config import Scenario
@@ -54,8 +57,8 @@ class Outcome:
 
 def evaluate(run: FinishedRun) -> Outcome:
     """Solve canonically and score."""
-    lives = run.ledger.lives()
-    solution = solve(lives, run.ledger.classes(lives))
+    merges = merges_of(run.ledger)
+    solution = solve(run.ledger.lives(), merges.classes)
     landmark_cov, _ = marginal_covariances(solution)
     score = score_map(solution, landmark_cov, run.recording, run.truths)
     report = {
@@ -64,17 +67,27 @@ def evaluate(run: FinishedRun) -> Outcome:
         "seed": run.scenario.run.seed,
         "steps": max(log.steps for log in run.recording.logs.values()),
         "wall_s": run.wall_s,
-        "digest": run.ledger.map_digest().hex(),
+        "digest": run.ledger.map_digest(merges.classes).hex(),
         **{name: value for name, value in vars(score).items() if name != "landmark_truth"},
         **fleet_association(run.recording, {name: drive.assigned for name, drive in run.drives.items()}).fields(),
         "doubtful_vehicles": sorted({s.vehicle for s in run.ledger.streams.values() if not s.healthy}),
         "vehicles": {name: _vehicle(run, name) for name in run.recording.logs},
         "frames": _frames(solution),
+        "merging": _merging(merges),
         "meetings": meeting_report(run.ledger, run.recording) if run.scenario.figure == "meetings" else [],
         "sightings_left_out": run.recording.skipped,
         "fusion": run.fusion,
     }
     return Outcome(solution=solution, landmark_cov=landmark_cov, score=score, report=report)
+
+
+def _merging(merges: Merges) -> dict[str, Any]:
+    """Pairs of landmarks of different vehicles that were compared by their place, and why some were kept apart."""
+    return {
+        "candidates": len(merges.considered),
+        "merged": len(merges.considered) - len(merges.refused),
+        "kept_apart": dict(sorted(Counter(str(each.reason) for each in merges.refused).items())),
+    }
 
 
 def _frames(solution: JointSolution) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from fleet_seif.wire import decode_snapshot
 from fusion import records
 from fusion.core import FusionCore
 from fusion.ledger import Ledger
+from fusion.merges import run_digest
 from fusion.service import restore
 from scenarios import output, watch
 from scenarios.access import Kind, Member
@@ -95,7 +96,7 @@ def ledger_info(file: Path, console: Console) -> Ledger:
     )
     console.print(table)
     console.print(
-        f"map digest    {ledger.map_digest().hex()}\nledger digest {ledger.ledger_digest().hex()}", highlight=False
+        f"map digest    {run_digest(ledger).hex()}\nledger digest {ledger.ledger_digest().hex()}", highlight=False
     )
     return ledger
 

@@ -248,12 +248,14 @@ class Outbox:
             return
         old = self._trimmed
         innovation, dof, refused = (old.innovation, old.innovation_dof, old.refused) if old else (0.0, 0, 0)
+        aliases = {(a, b): added for a, b, added in old.aliases} if old else {}
         while self._sent and self._sent[0].message.last <= points[-1]:
             gone = self._sent.popleft()
             self._acknowledged -= 1
             innovation += gone.message.innovation
             dof += gone.message.innovation_dof
             refused += gone.message.refused
+            aliases.update({(min(a, b), max(a, b)): added for a, b, added in gone.message.aliases})
             for part in gone.message.parts:
                 if part.end_pose is not None:
                     self._ends[part.frame] = part.end_pose
@@ -262,6 +264,7 @@ class Outbox:
         self._trimmed = Trimmed(
             newest=gone.data, prefix_digest=gone.prefix_digest,
             innovation=innovation, innovation_dof=dof, refused=refused,
+            aliases=tuple((*pair, added) for pair, added in aliases.items()),
         )  # fmt: skip
         self._trimmed_last = gone.message.last
         low, high = (records.numbered(records.MESSAGE, self.ordinal, n) for n in (0, self._trimmed_last + 1))
@@ -317,7 +320,7 @@ class Outbox:
         message = dataclasses.replace(
             newest, first=0, hello=hello, parts=self._parts([total.delta() for total in totals]), landmarks=named,
             innovation=self._trimmed.innovation, innovation_dof=self._trimmed.innovation_dof,
-            refused=self._trimmed.refused,
+            refused=self._trimmed.refused, aliases=self._trimmed.aliases,
         )  # fmt: skip
         return Snapshot(message=message, prefix_digest=self._trimmed.prefix_digest)
 

@@ -89,22 +89,30 @@ class EpochRecord:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trimmed:
-    """The acknowledged prefix of an epoch: its last message, the digest there and the sums of its statistics."""
+    """The acknowledged prefix of an epoch: its last message, the digest there and the sums of its statistics.
+
+    aliases: the last word on each pair.
+    """
 
     newest: bytes
     prefix_digest: bytes
     innovation: float
     innovation_dof: int
     refused: int
+    aliases: tuple[tuple[int, int, bool], ...] = ()
 
     def pack(self) -> bytes:
-        fields = (self.newest, self.prefix_digest, self.innovation, self.innovation_dof, self.refused)
+        statistics = (self.innovation, self.innovation_dof, self.refused)
+        fields = (self.newest, self.prefix_digest, *statistics, self.aliases)
         return bytes(msgpack.packb(fields))
 
     @staticmethod
     def read(data: bytes) -> "Trimmed":
-        newest, digest, innovation, dof, refused = msgpack.unpackb(data)
-        return Trimmed(newest=newest, prefix_digest=digest, innovation=innovation, innovation_dof=dof, refused=refused)
+        newest, digest, innovation, dof, refused, aliases = msgpack.unpackb(data, use_list=False)
+        return Trimmed(
+            newest=newest, prefix_digest=digest, innovation=innovation, innovation_dof=dof, refused=refused,
+            aliases=aliases,
+        )  # fmt: skip
 
 
 def fingerprint(delta: FrameDelta) -> bytes:
