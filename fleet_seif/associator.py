@@ -3,29 +3,47 @@
 1. Sightings are compared with the landmarks of a local map (fleet_seif.local_map), which they then improve.
 2. A sighting that fits nothing and is near nothing begins a provisional landmark. Once it has been sighted often enough
    it is accepted and gets a number; its earlier sightings belong to it from then on. Else it is forgotten.
-3. A landmark that has not been sighted for a while is dormant: where the vehicle is relative to it is not well known,
-   and one wrong pair would move all that follows. Pairs with dormant landmarks count once `wake_together` of them fit in
-   one step, or one has fitted in two steps soon after each other; until then they move nothing.
+3. A landmark that has not been sighted for a while, and whose place the vehicle does not know well enough to tell it
+   from its neighbours, is doubtful: one wrong pair would move all that follows. It is not compared with sightings. What
+   is there begins anew. When the frame closes, landmarks that were begun twice are found by the pattern of all of them
+   (own_duplicates); they become aliases.
 4. Keys: the number of an accepted landmark; below NONE, a provisional one; NONE: not told, or nobody's.
 5. `decide` changes nothing; `take` does, once the filter has taken the step too.
 6. A function of this vehicle's own readings and settings alone.
 """
 
+import itertools
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fleet_seif.association import associate, limits
+from fleet_seif.association import associate
 from fleet_seif.association_guards import Verdict
 from fleet_seif.config import AssociationSettings
 from fleet_seif.errors import ReadingRefused
-from fleet_seif.local_map import LocalMap, begun_at, expected, in_reach, kept, moved, nothing_known, sighted, with_new
-from fleet_seif.models import COMPASS_XY, innovation
+from fleet_seif.local_map import (
+    LocalMap,
+    begun_at,
+    expected,
+    from_pose_std,
+    in_reach,
+    kept,
+    moved,
+    nothing_known,
+    sighted,
+    with_new,
+)
+from fleet_seif.models import COMPASS_XY
+from fleet_seif.own_duplicates import nearest_m, own_duplicates
 from fleet_seif.records import Floats, Ints
 
 NONE: Final = -1
+DOUBTFUL_SIGMAS: Final = 3.0
+"""A landmark is told from its neighbour where so many standard deviations reach at most half way to it."""
+TOGETHER_LEAST: Final = 2
+"""Poses from which two landmarks must have been sighted to be two: once may be clutter."""
 REACH_SIGMAS: Final = 4.0
 """How far beyond what was measured a landmark may be, in standard deviations, to be compared at all."""
 
@@ -36,14 +54,6 @@ class Provisional:
 
     born: int
     sightings: int
-
-
-@dataclass(frozen=True)
-class Waking:
-    """A dormant landmark that a sighting fitted. key: of that sighting, until the landmark is awake. step: of it."""
-
-    key: int
-    step: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +70,6 @@ class Decision:
     dof: int
     local: LocalMap
     provisional: dict[int, Provisional]
-    waking: dict[int, Waking]
     next: int
 
 
@@ -74,10 +83,10 @@ class Associator:
         self.travel_max_m = np.inf
         self.reach_m = 0.0
         self._provisional: dict[int, Provisional] = {}
-        self._waking: dict[int, Waking] = {}
         self._last: dict[int, int] = {}
         self._next = NONE - 1
-        self._birth_gate = limits(settings, 0).birth_gate
+        self._together: Counter[tuple[int, int]] = Counter()
+        self._apart: dict[int, float] = {}
 
     def decide(self, step: int, motion: tuple[Floats, Floats] | None, z: Floats, Z: Floats, known: int) -> Decision:
         """Raises ReadingRefused where a sighting is none, NumericalError where the local map cannot be.
@@ -88,71 +97,40 @@ class Associator:
         _check(z, Z)
         local = self.local if motion is None else moved(self.model, self.local, *motion)
         near = in_reach(local.mean, local.P, _reach(self.model, z, Z), REACH_SIGMAS)
-        h, C = expected(self.model, local.mean, local.P, near)
-        found = associate(z, Z, h, C, self.settings, model=self.model)
-        candidates = local.keys[near]
-        dormant = np.array([self._is_dormant(key, step) for key in candidates.tolist()], bool)
-        keys, waking, accepted, key = self._paired(step, found.assignment, candidates, dormant)
-        paired = np.flatnonzero(
-            (found.assignment >= 0) & (keys != NONE) & ~np.isin(keys, [w.key for w in waking.values()])
-        )
-        local, squared = sighted(self.model, local, near[found.assignment[paired]], z[paired], Z[paired])
-        provisional = dict(self._provisional)
+        near = near[[not self._is_doubtful(local, i, step) for i in near.tolist()]]
+        found = associate(z, Z, *expected(self.model, local.mean, local.P, near), self.settings, model=self.model)
+        paired = np.flatnonzero(found.assignment >= 0)
+        which = near[found.assignment[paired]]
+        keys = np.full(len(z), NONE)
+        keys[paired] = local.keys[which]
+        local, squared = sighted(self.model, local, which, z[paired], Z[paired])
+        provisional, key = dict(self._provisional), self._next
         for i in np.flatnonzero(found.verdict == Verdict.NEW).tolist():
-            if self._is_near(z[i], Z[i], h, C, np.flatnonzero(dormant)):
-                continue
             local = with_new(self.model, local, key, z[i], Z[i])
             keys[i], provisional[key] = key, Provisional(step, 0)
             key -= 1
         for each in keys[keys < NONE].tolist():
-            if each in provisional:
-                provisional[each] = Provisional(provisional[each].born, provisional[each].sightings + 1)
-        made = Decision(keys, accepted, squared, 2 * len(paired), local, provisional, waking, key)
-        return self._settled(step, known, made)
+            provisional[each] = Provisional(provisional[each].born, provisional[each].sightings + 1)
+        return self._settled(step, known, Decision(keys, {}, squared, 2 * len(paired), local, provisional, key))
 
-    def _is_dormant(self, key: int, step: int) -> bool:
-        return key >= 0 and step - self._last.get(key, step) > self.settings.awake_steps
-
-    def _is_near(self, z: Floats, Z: Floats, h: Floats, C: Floats, which: Ints) -> bool:
-        """Whether a sighting is within the birth gate of one of these candidates, taken or not."""
-        return any(
-            pair_squared(self.model, z, Z, h[j], C[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]) <= self._birth_gate
-            for j in which.tolist()
-        )
-
-    def _paired(
-        self, step: int, assignment: Ints, candidates: Ints, dormant: NDArray[np.bool_]
-    ) -> tuple[Ints, dict[int, Waking], dict[int, int], int]:
-        """Keys of sightings that are paired (rule 3), dormant landmarks that are waking, and those that have."""
-        settings, key = self.settings, self._next
-        keys, accepted = np.full(len(assignment), NONE), dict[int, int]()
-        waking = {n: each for n, each in self._waking.items() if step - each.step <= settings.wake_steps}
-        paired = np.flatnonzero(assignment >= 0)
-        together = np.count_nonzero(dormant[assignment[paired]]) >= settings.wake_together
-        for i in paired.tolist():
-            number = int(candidates[assignment[i]])
-            if not dormant[assignment[i]]:
-                keys[i] = number
-            elif together or number in waking:
-                keys[i] = number
-                if number in waking:
-                    accepted[waking.pop(number).key] = number
-            else:
-                keys[i], waking[number] = key, Waking(key, step)
-                key -= 1
-        return keys, waking, accepted, key
+    def _is_doubtful(self, local: LocalMap, i: int, step: int) -> bool:
+        """Rule 3, of the landmark at position i."""
+        key = int(local.keys[i])
+        if key < 0 or step - self._last.get(key, step) <= self.settings.awake_steps:
+            return False
+        return 2.0 * DOUBTFUL_SIGMAS * from_pose_std(local.P, i) > self._apart.get(key, np.inf)
 
     def _settled(self, step: int, known: int, made: Decision) -> Decision:
         """Provisional landmarks that are accepted now, and those that are forgotten."""
         settings, accepted, gone = self.settings, made.accepted, set[int]()
         for key in made.keys[made.keys < NONE].tolist():  # in the order of sightings: that of numbers
-            if key in made.provisional and made.provisional[key].sightings >= settings.confirm_sightings:
-                accepted[key] = known + sum(number >= known for number in accepted.values())
+            if made.provisional[key].sightings >= settings.confirm_sightings:
+                accepted[key] = known + len(accepted)
         for key, each in made.provisional.items():
             if key not in accepted and step - each.born >= settings.confirm_steps - 1:
                 gone.add(key)
         for key in (*accepted, *gone):
-            made.provisional.pop(key, None)
+            del made.provisional[key]
         local = made.local
         if accepted or gone:
             names = np.array([accepted.get(key, key) for key in local.keys.tolist()], np.int64)
@@ -163,8 +141,9 @@ class Associator:
 
     def take(self, step: int, decision: Decision, z: Floats) -> None:
         """The step has been taken."""
-        self.local, self._next = decision.local, decision.next
-        self._provisional, self._waking = decision.provisional, decision.waking
+        self.local, self._provisional, self._next = decision.local, decision.provisional, decision.next
+        seen = sorted(key for key in decision.keys.tolist() if key >= 0)
+        self._together.update(itertools.combinations(seen, 2))
         self._last.update((key, step) for key in decision.keys.tolist() if key >= 0)
         if len(z):
             self.reach_m = max(self.reach_m, float(_distances(self.model, z).max()))
@@ -173,9 +152,14 @@ class Associator:
         """Whether this pose in the frame is so far from its start that the local map may lack what is sighted."""
         return bool(np.hypot(pose[0], pose[1]) >= self.travel_max_m)
 
+    def duplicates(self) -> list[tuple[int, int]]:
+        """Landmarks that have been begun twice (rule 3): pairs of keys."""
+        return own_duplicates(self.local, lambda a, b: self._together[min(a, b), max(a, b)] >= TOGETHER_LEAST)
+
     def begin(self, near: LocalMap, travel_max_m: float) -> None:
         """A frame begins where the vehicle is: with these landmarks, as seen from there, and the provisional ones."""
         carried = np.flatnonzero(self.local.keys < NONE)
+        self._apart = dict(zip(near.keys.tolist(), nearest_m(near.landmarks).tolist(), strict=True))
         self.local, self.travel_max_m = beside(near, begun_at(kept(self.local, carried))), travel_max_m
 
     def state(self) -> dict[str, Any]:
@@ -184,7 +168,8 @@ class Associator:
         return {
             "mean": local.mean.tobytes(), "P": local.P.tobytes(), "keys": local.keys.tobytes(), "next": self._next,
             "travel": self.travel_max_m, "reach": self.reach_m,
-            "last": list(self._last.items()), "waking": [(n, each.key, each.step) for n, each in self._waking.items()],
+            "last": list(self._last.items()), "together": [(*pair, count) for pair, count in self._together.items()],
+            "apart": list(self._apart.items()),
             "provisional": [(key, each.born, each.sightings) for key, each in self._provisional.items()],
         }  # fmt: skip
 
@@ -194,14 +179,9 @@ class Associator:
         P = np.frombuffer(state["P"]).reshape(len(mean), len(mean))
         self.local = LocalMap(mean, P, np.frombuffer(state["keys"], np.int64))
         self.travel_max_m, self.reach_m, self._next = state["travel"], state["reach"], state["next"]
-        self._last, self._waking = dict(state["last"]), {n: Waking(key, step) for n, key, step in state["waking"]}
+        self._last, self._apart = dict(state["last"]), dict(state["apart"])
+        self._together = Counter({(a, b): count for a, b, count in state["together"]})
         self._provisional = {key: Provisional(born, sightings) for key, born, sightings in state["provisional"]}
-
-
-def pair_squared(model: int, z: Floats, Z: Floats, h: Floats, C: Floats) -> float:
-    """r' (C + Z)^-1 r of one pair."""
-    r = innovation(model, z, h)
-    return float(r @ np.linalg.solve(C + Z, r))
 
 
 def beside(a: LocalMap, b: LocalMap) -> LocalMap:

@@ -15,6 +15,7 @@
 
 import dataclasses
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,10 +30,10 @@ from fleet_seif.frame_deltas import quantised
 from fleet_seif.frame_log import FrameLog
 from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
-from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_names
+from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes, landmark_names
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
-from fleet_seif.own_map import OwnMap
+from fleet_seif.own_map import OwnMap, first_names
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 from fleet_seif.seif import Seif, Taken
 
@@ -89,6 +90,7 @@ class FramedFilter:
         self._closed: list[Closed] = []
         self._associator = Associator(settings.association, model) if settings.identities == "associated" else None
         self._own_map = OwnMap()
+        self._new_aliases: list[tuple[int, int, bool]] = []
         self._assigned: list[Ints] = []
         self._open()
 
@@ -110,7 +112,8 @@ class FramedFilter:
         """Which landmark each sighting taken so far is of, by number, -1 none, shape (s,)."""
         keys = np.concatenate([*self._assigned, np.empty(0, np.int64)]).astype(np.int64)
         if self._associator is not None:
-            return np.maximum(keys, NONE)
+            first = first_names(self._own_map.aliases, len(self._names.signatures))
+            return np.array([first[key] if key >= 0 else NONE for key in keys.tolist()], np.int64)
         numbers = {signature: number for number, signature in enumerate(self.signatures)}
         return np.array([numbers[key] for key in keys.tolist()], np.int64)
 
@@ -155,13 +158,18 @@ class FramedFilter:
         self._localised, self._asked = self.steps, (self.frame, self.filter.pose)
         return Life(
             vehicle="", life=0, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)), frames=self.published(),
-            signatures=tuple(self.signatures),
+            signatures=tuple(self.signatures), aliases=tuple(sorted(self._own_map.aliases)),
         )  # fmt: skip
 
     def solve_own(self, life: Life) -> JointSolution | None:
         """The joint solution of `own_life`; None where there is none."""
         try:
-            return self._solver.update([life], tuple((name,) for name in landmark_names(life)))
+            return self._solver.update(
+                [life],
+                tuple((name,) for name in landmark_names(life))
+                if self._associator is None
+                else landmark_classes([life]),
+            )
         except NumericalError as error:
             log.warning("not_localised reason=%s", error)
             return None
@@ -272,9 +280,22 @@ class FramedFilter:
     def _look_around(self, closed: Closed, associator: Associator) -> None:
         """What lies around the end of a frame that closes, for the next."""
         solved = self._solved(closed)
+        self._alias(associator.duplicates())
         self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
         near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
         associator.begin(*near)
+
+    def _alias(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Landmarks that are one from now on."""
+        for pair in pairs:
+            one, other = min(pair), max(pair)
+            self._own_map.aliases.append((one, other))
+            self._new_aliases.append((one, other, True))
+
+    def take_aliases(self) -> tuple[tuple[int, int, bool], ...]:
+        """Pairs of landmarks that have become one, or are not any more, since the last call: to be published."""
+        taken, self._new_aliases = tuple(self._new_aliases), []
+        return taken
 
     def _solved(self, closed: Closed) -> tuple[FrameDelta, Floats] | None:
         """The batch over a closed frame as one cumulative delta, and its end pose; None where it fails."""
@@ -346,6 +367,7 @@ class FramedFilter:
         return {
             **state, "signatures": self._names.signatures, "log": self._log.state(), "closed": closed,
             "totals": [pack_delta(total.delta()) for total in self.totals],
+            "aliases": self._own_map.aliases, "new_aliases": self._new_aliases,
             "own": [pack_delta(delta) for delta in self._own_map.frames], "ends": np.array(self.ends).tobytes(),
         }  # fmt: skip
 
@@ -372,6 +394,8 @@ class FramedFilter:
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
+        self._own_map.aliases = [(a, b) for a, b in state["aliases"]]
+        self._new_aliases = [(a, b, added) for a, b, added in state["new_aliases"]]
         self._own_map.frames = [read_delta(data) for data in state["own"]]
         self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
 

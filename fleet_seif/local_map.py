@@ -111,6 +111,16 @@ def in_reach(mean: Floats, P: Floats, reach: float, sigmas: float) -> Ints:
     return found[:count]
 
 
+@kernel
+def from_pose_std(P: Floats, i: int) -> float:
+    """Largest standard deviation of where landmark i lies from the pose, the heading's share left out, m."""
+    a = 3 + 2 * i
+    xx = P[a, a] + P[0, 0] - 2.0 * P[a, 0]
+    yy = P[a + 1, a + 1] + P[1, 1] - 2.0 * P[a + 1, 1]
+    xy = P[a, a + 1] + P[0, 1] - P[a, 1] - P[a + 1, 0]
+    return float(np.sqrt(max((xx + yy) / 2 + np.sqrt((xx - yy) ** 2 / 4 + xy * xy), 0.0)))
+
+
 def moved(model: int, local: LocalMap, u: Floats, cov: Floats) -> LocalMap:
     """After odometry u (3,) with covariance cov (3, 3)."""
     pose, J_x, J_u = move(model, local.pose, u)

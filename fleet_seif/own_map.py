@@ -4,24 +4,26 @@ Solved anew, warm, when a frame closes: with what is around, it is a function of
 serves association; nothing of it is published.
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
 from fleet_seif.information import FrameDelta
-from fleet_seif.joint import JointSolver, Life, landmark_names
+from fleet_seif.joint import JointSolver, Life, landmark_classes
 from fleet_seif.local_map import LocalMap, seen_from
-from fleet_seif.records import UNKNOWN_SIGNATURE
+from fleet_seif.records import UNKNOWN_SIGNATURE, Ints
 
 TRAVEL_LEAST: Final = 0.25
 """Share of the reach of its sightings that a vehicle may always travel within a frame."""
 
 
 class OwnMap:
-    """See above. Frames are numbered from 0 on."""
+    """See above. Frames are numbered from 0 on. aliases: pairs of landmarks that are one, the lesser number first."""
 
     def __init__(self) -> None:
         self.frames: list[FrameDelta] = []
+        self.aliases: list[tuple[int, int]] = []
         self._solver = JointSolver()
 
     def put(self, frame: int, total: FrameDelta) -> None:
@@ -39,9 +41,9 @@ class OwnMap:
         last = max((int(delta.variables[-1]) for delta in self.frames if len(delta.variables)), default=0)
         life = Life(
             vehicle="", life=0, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)), frames=tuple(self.frames),
-            signatures=(UNKNOWN_SIGNATURE,) * last,
+            signatures=(UNKNOWN_SIGNATURE,) * last, aliases=tuple(sorted(self.aliases)),
         )  # fmt: skip
-        solution = self._solver.update([life], tuple((name,) for name in landmark_names(life)))
+        solution = self._solver.update([life], landmark_classes([life]))
         newest = [k for _, _, k in solution.poses].index(-1)
         pose, landmarks = solution.pose_mean[newest], solution.landmark_mean
         away = np.hypot(*(landmarks - pose[:2]).T)
@@ -52,3 +54,12 @@ class OwnMap:
         P = self._solver.joint_covariance(solution, chosen, np.array([newest]))
         numbers = np.array([names[0].number for names in solution.classes], np.int64)
         return seen_from(pose, landmarks[chosen], P, numbers[chosen]), travel_max_m
+
+
+def first_names(aliases: Sequence[tuple[int, int]], count: int) -> Ints:
+    """The least number of all that are one landmark, for each number, shape (count,)."""
+    first = np.arange(count)
+    for a, b in aliases:
+        one, other = sorted((int(first[a]), int(first[b])))
+        first[first == other] = one
+    return first
