@@ -23,6 +23,7 @@ from fleet_seif.association import associate
 from fleet_seif.association_guards import Verdict
 from fleet_seif.config import AssociationSettings
 from fleet_seif.errors import ReadingRefused
+from fleet_seif.frame_log import NONE
 from fleet_seif.local_map import (
     LocalMap,
     begun_at,
@@ -39,7 +40,6 @@ from fleet_seif.models import COMPASS_XY
 from fleet_seif.own_duplicates import nearest_m, own_duplicates
 from fleet_seif.records import Floats, Ints
 
-NONE: Final = -1
 DOUBTFUL_SIGMAS: Final = 3.0
 """A landmark is told from its neighbour where so many standard deviations reach at most half way to it."""
 TOGETHER_LEAST: Final = 2

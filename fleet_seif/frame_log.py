@@ -1,15 +1,48 @@
-"""The readings of one frame, kept until it is closed, and longer where nothing tells which landmark a sighting is of."""
+"""The readings of one frame, kept until it is closed, and what each of its sightings is of."""
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
-from fleet_seif.models import place
+from fleet_seif.jit import kernel
+from fleet_seif.models import innovation_numbers, place, sight_numbers
 from fleet_seif.records import Floats, Ints, Sightings
 from fleet_seif.seif import Taken
+
+NONE: Final = -1
+"""Signature of a sighting of which it is not known what it is of."""
+AGAIN_GATE: Final = 11.0
+"""Squared residual up to which a sighting is of a landmark when the frame is known (chi-square, 2 degrees of freedom)."""
+AGAIN_MARGIN: Final = 6.0
+"""By how much the next best landmark has to fit worse."""
+
+
+@kernel
+def squared_residuals(model: int, x: Floats, landmarks: Floats, z: Floats, Z: Floats) -> Floats:
+    """r' Z^-1 r of every sighting with every landmark, shape (s, n)."""
+    d2 = np.empty((len(z), len(landmarks)))
+    for j in range(len(landmarks)):
+        numbers = sight_numbers(model, x, landmarks[j, 0], landmarks[j, 1])
+        for i in range(len(z)):
+            r0, r1 = innovation_numbers(model, z[i, 0], z[i, 1], numbers[0], numbers[1])
+            det = Z[i, 0, 0] * Z[i, 1, 1] - Z[i, 0, 1] * Z[i, 1, 0]
+            d2[i, j] = (Z[i, 1, 1] * r0 * r0 - 2.0 * Z[i, 0, 1] * r0 * r1 + Z[i, 0, 0] * r1 * r1) / det
+    return d2
+
+
+def _best(d2: Floats) -> Ints:
+    """Of each sighting the column that is its own, -1 for none, shape (s,)."""
+    found, best = np.argmin(d2, axis=1), d2.min(axis=1)
+    rest = d2.copy()
+    rest[np.arange(len(d2)), found] = np.inf
+    clear = (best <= AGAIN_GATE) & (rest.min(axis=1) - best >= AGAIN_MARGIN)
+    for i in np.flatnonzero(clear).tolist():
+        others = np.flatnonzero((found == found[i]) & (np.arange(len(d2)) != i))
+        clear[i] = not len(others) or bool(best[others].min() >= best[i] + AGAIN_MARGIN)
+    return np.where(clear, found, NONE)
 
 
 @dataclass
@@ -38,6 +71,25 @@ class FrameLog:
         for _, names, _, _ in self.sightings:
             names[names == old] = new
 
+    def decided_again(self, model: int, poses: Floats, signatures: Ints, landmarks: Floats) -> bool:
+        """Tell once more what sightings are of, now that the whole frame is known. Returns whether anything changed.
+
+        A sighting is given to the landmark that fits it best, if no other fits nearly as well and no better sighting
+        of it was made from the same pose; else to none.
+
+        Args:
+            poses (T, 3), signatures (n,), landmarks (n, 2): as the batch has found them.
+        """
+        if not len(signatures):
+            return False
+        whole, changed = np.concatenate([np.zeros((1, 3)), poses]), False
+        for step, names, z, Z in self.sightings:
+            found = _best(squared_residuals(model, whole[step], landmarks, z, Z))
+            new = np.where(found >= 0, signatures[found], np.minimum(names, NONE))
+            changed |= not np.array_equal(new, names)
+            names[:] = new
+        return changed
+
     def state(self) -> tuple[Any, ...]:
         """Plain values for msgpack; `restored` takes them back."""
         seen = [
@@ -64,7 +116,7 @@ class FrameLog:
         )  # fmt: skip
 
     def guesses(self, model: int, signatures: Ints, landmarks: Floats) -> tuple[Ints, Floats]:
-        """The landmarks that these sightings are of, (n,) and (n, 2) m: as estimated, or where the first one puts it."""
+        """The landmarks that these sightings are of, (n,) and (n, 2) m: as estimated, or where the first puts it."""
         known = dict(zip(signatures.tolist(), landmarks, strict=True))
         poses = [np.zeros(3), *(pose for _, _, pose in self.motions)]
         for step, names, z, _ in self.sightings:

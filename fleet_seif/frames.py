@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from fleet_seif.associator import NONE, Associator, Decision
+from fleet_seif.associator import Associator, Decision
 from fleet_seif.config import FilterSettings
 from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.errors import NumericalError
 from fleet_seif.filters import Names, StepResult, checked_reading
 from fleet_seif.frame_deltas import quantised
-from fleet_seif.frame_log import FrameLog
+from fleet_seif.frame_log import NONE, FrameLog
 from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes, landmark_names
@@ -63,9 +63,6 @@ class Closed:
     landmarks: Floats
     signatures: Ints
     numbers: Ints
-
-
-KEPT_STEPS = 1000
 
 
 class FramedFilter:
@@ -244,8 +241,6 @@ class FramedFilter:
         for key, number in decision.accepted.items():
             for log_ in (self._log, *(closed.log for closed in self._closed)):
                 log_.rename(key, number)
-            for keys in self._assigned[-KEPT_STEPS:]:
-                keys[keys == key] = number
         new = (UNKNOWN_SIGNATURE,) * len(result.new)
         result = dataclasses.replace(
             result, new=new, innovation=decision.innovation, sightings=decision.dof // 2,
@@ -307,6 +302,10 @@ class FramedFilter:
             numbers = signatures
         try:
             batch = closed.log.solved(self.model, signatures, landmarks, self.settings.frame_huber)
+            if self._associator is not None:
+                known = signatures[batch.seen], batch.mean[3:].reshape(-1, 2)[batch.seen]
+                if closed.log.decided_again(self.model, batch.poses, *known):
+                    batch = closed.log.solved(self.model, signatures, landmarks, self.settings.frame_huber)
             order = np.argsort(numbers)
             order = order[batch.seen[order]]
             rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
@@ -391,6 +390,7 @@ class FramedFilter:
             )
             for frame, due, log, landmarks, signatures, numbers in state["closed"]
         ]  # fmt: skip
+        self._share_keys()
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
@@ -398,6 +398,17 @@ class FramedFilter:
         self._new_aliases = [(a, b, added) for a, b, added in state["new_aliases"]]
         self._own_map.frames = [read_delta(data) for data in state["own"]]
         self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
+
+    def _share_keys(self) -> None:
+        """What sightings are taken for is kept once: by the logs of frames and by `assigned`."""
+        if self._associator is None:
+            return
+        (keys,), logs = self._assigned, [*(closed.log for closed in self._closed), self._log]
+        at = len(keys) - sum(len(names) for each in logs for _, names, _, _ in each.sightings)
+        for each in logs:
+            for i, (step, names, z, Z) in enumerate(each.sightings):
+                each.sightings[i] = step, keys[at : at + len(names)], z, Z
+                at += len(names)
 
     def published(self) -> tuple[FrameDelta, ...]:
         """The sum of all that has been published, frame by frame."""
