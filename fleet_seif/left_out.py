@@ -108,7 +108,7 @@ def _system(
     variable = frames.variable.copy()
     for f, key in enumerate(system.keys):
         if key is not None:
-            first, last = frames.first_variable[f], frames.first_variable[f + 1]
+            first, last = frames.first_variable[f], frames.end_variable[f]
             variable[first:last] = maps[key[:2]][variable[first:last]]
     frames = frames._replace(variable=variable)
     at = _evaluated(frames, np.concatenate([system.at.X, system.at.X[split.merged]]), system.at)
@@ -124,7 +124,7 @@ def _system(
 
 def _evaluated(frames: Frames, X: Floats, merged: Evaluation) -> Evaluation:
     """What frames say at X, which is the merged state: chi-squares and weights are those of the merged system."""
-    active = np.flatnonzero(np.diff(frames.first_variable) + (frames.start >= 0) > 0)
+    active = np.flatnonzero(frames.end_variable - frames.first_variable + (frames.start >= 0) > 0)
     turns, g, z = np.zeros((len(frames.start), 2)), np.zeros_like(X), np.zeros(len(frames.mean))
     turns_into(turns, frames, active, X)
     chi_square, weight = np.zeros(len(frames.start)), np.ones(len(frames.start))

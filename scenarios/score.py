@@ -99,15 +99,15 @@ def majority(values: list[int]) -> int:
 
 
 def _merges(solution: JointSolution, member_truth: list[list[int]]) -> tuple[int, int, int]:
-    """Over pairs of different vehicles' landmarks: merged, merged wrongly, not merged though one in truth.
+    """Over pairs of different vehicles in a class: merged, merged wrongly, not merged though one in truth.
 
     Of two that are both no true landmark it cannot be told whether they are the same.
     """
-    members = [
-        (c, name.vehicle, truth)
-        for c, (names, truths) in enumerate(zip(solution.classes, member_truth, strict=True))
-        for name, truth in zip(names, truths, strict=True)
-    ]
+    members = []
+    for c, (names, truths) in enumerate(zip(solution.classes, member_truth, strict=True)):
+        for vehicle in sorted({name.vehicle for name in names}):  # who has two names for it has merged them itself
+            own = [truth for name, truth in zip(names, truths, strict=True) if name.vehicle == vehicle]
+            members.append((c, vehicle, majority(own)))
     merges = wrong = 0
     for c in range(len(solution.classes)):
         group = [m for m in members if m[0] == c] if len(solution.classes[c]) > 1 else []

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from fleet_seif import frames as frames_module
+from fleet_seif import frame_log
 from fleet_seif.config import FilterSettings, PublishSettings
 from fleet_seif.errors import NumericalError
 from fleet_seif.frames import FramedFilter
@@ -147,7 +147,7 @@ def test_where_the_batch_fails_the_filters_posterior_stays(monkeypatch: pytest.M
     def fails(*arguments: object, **options: object) -> None:
         raise NumericalError("no")
 
-    monkeypatch.setattr(frames_module, "solve_frame", fails)
+    monkeypatch.setattr(frame_log, "solve_frame", fails)
     framed, said = run(ADAPTIVE, LOG)
     assert not any(part.status is FrameStatus.CORRECTED for parts in said for part in parts)
     life = Life(
