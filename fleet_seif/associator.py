@@ -3,7 +3,7 @@
 1. Sightings are compared with the landmarks of a local map (fleet_seif.local_map), which they then improve.
 2. A sighting that fits nothing and is near nothing begins a provisional landmark. Once it has been sighted often enough
    it is accepted and gets a number; its earlier sightings belong to it from then on. Else it is forgotten.
-3. A landmark that has not been sighted for a while, and whose place the vehicle does not know well enough to tell it
+3. A landmark that has not been sighted in this frame, and whose place the vehicle does not know well enough to tell it
    from its neighbours, is doubtful: one wrong pair would move all that follows. It is not compared with sightings. What
    is there begins anew. When the frame closes, landmarks that were begun twice are found by the pattern of all of them
    (own_duplicates); they become aliases.
@@ -37,7 +37,7 @@ from fleet_seif.local_map import (
     with_new,
 )
 from fleet_seif.models import COMPASS_XY
-from fleet_seif.own_duplicates import nearest_m, own_duplicates
+from fleet_seif.own_duplicates import own_duplicates
 from fleet_seif.records import Floats, Ints
 
 DOUBTFUL_SIGMAS: Final = 3.0
@@ -85,6 +85,7 @@ class Associator:
         self._provisional: dict[int, Provisional] = {}
         self._last: dict[int, int] = {}
         self._next = NONE - 1
+        self._began = -1
         self._together: Counter[tuple[int, int]] = Counter()
         self._apart: dict[int, float] = {}
 
@@ -116,7 +117,7 @@ class Associator:
     def _is_doubtful(self, local: LocalMap, i: int, step: int) -> bool:
         """Rule 3, of the landmark at position i."""
         key = int(local.keys[i])
-        if key < 0 or step - self._last.get(key, step) <= self.settings.awake_steps:
+        if key < 0 or self._last.get(key, step) > self._began:
             return False
         return 2.0 * DOUBTFUL_SIGMAS * from_pose_std(local.P, i) > self._apart.get(key, np.inf)
 
@@ -156,18 +157,35 @@ class Associator:
         """Landmarks that have been begun twice (rule 3): pairs of keys."""
         return own_duplicates(self.local, lambda a, b: self._together[min(a, b), max(a, b)] >= TOGETHER_LEAST)
 
-    def begin(self, near: LocalMap, travel_max_m: float) -> None:
-        """A frame begins where the vehicle is: with these landmarks, as seen from there, and the provisional ones."""
+    def begin(self, step: int, near: LocalMap, travel_max_m: float) -> None:
+        """A frame begins after this step: with these landmarks, as seen from there, and the provisional ones."""
+        self._began = step
         carried = np.flatnonzero(self.local.keys < NONE)
-        self._apart = dict(zip(near.keys.tolist(), nearest_m(near.landmarks).tolist(), strict=True))
+        self._apart = self._spacing(near)
         self.local, self.travel_max_m = beside(near, begun_at(kept(self.local, carried))), travel_max_m
+
+    def _spacing(self, near: LocalMap) -> dict[int, float]:
+        """How far each landmark is at most from its nearest neighbour, m: the neighbour may not have been sighted yet.
+
+        Only landmarks that were sighted together count: others may be one.
+        """
+        keys, places = near.keys.tolist(), near.landmarks
+        away = np.linalg.norm(places[:, None] - places[None], axis=2)
+        met = np.zeros_like(away, bool)
+        at = {key: i for i, key in enumerate(keys)}
+        for a, b in self._together:
+            if a in at and b in at:
+                met[at[a], at[b]] = met[at[b], at[a]] = True
+        nearest = np.where(met, away, np.inf).min(axis=1, initial=np.inf)
+        usual = np.median(nearest[np.isfinite(nearest)]) if np.any(met) else np.inf
+        return dict(zip(keys, np.minimum(nearest, usual).tolist(), strict=True))
 
     def state(self) -> dict[str, Any]:
         """Plain values for msgpack; `restore` takes them back."""
         local = self.local
         return {
             "mean": local.mean.tobytes(), "P": local.P.tobytes(), "keys": local.keys.tobytes(), "next": self._next,
-            "travel": self.travel_max_m, "reach": self.reach_m,
+            "began": self._began, "travel": self.travel_max_m, "reach": self.reach_m,
             "last": list(self._last.items()), "together": [(*pair, count) for pair, count in self._together.items()],
             "apart": list(self._apart.items()),
             "provisional": [(key, each.born, each.sightings) for key, each in self._provisional.items()],
@@ -179,6 +197,7 @@ class Associator:
         P = np.frombuffer(state["P"]).reshape(len(mean), len(mean))
         self.local = LocalMap(mean, P, np.frombuffer(state["keys"], np.int64))
         self.travel_max_m, self.reach_m, self._next = state["travel"], state["reach"], state["next"]
+        self._began = state["began"]
         self._last, self._apart = dict(state["last"]), dict(state["apart"])
         self._together = Counter({(a, b): count for a, b, count in state["together"]})
         self._provisional = {key: Provisional(born, sightings) for key, born, sightings in state["provisional"]}

@@ -34,8 +34,6 @@ class AssociationSettings(Settings):
     nodes_max: partial hypotheses looked at after which the best so far is taken, and again for all rivals together.
     confirm_sightings, confirm_steps: a new landmark is provisional until it has been sighted so many times within so
     many steps, the first included; else it is forgotten: clutter, or something that moves.
-    awake_steps: steps after its last sighting from which on a landmark is dormant. wake_together: so many dormant ones
-    that fit in one step are believed at once; one alone when it fits again within wake_steps.
     local_landmarks_max: landmarks around the start of a frame that sightings are compared with; where there are more, a
     frame closes before the vehicle leaves them behind.
 
@@ -52,9 +50,6 @@ class AssociationSettings(Settings):
     nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 500
     confirm_sightings: Annotated[int, Field(ge=1, le=100)] = 3
     confirm_steps: Annotated[int, Field(ge=1, le=1000)] = 8
-    awake_steps: Annotated[int, Field(ge=1, le=100_000)] = 25
-    wake_together: Annotated[int, Field(ge=1, le=100)] = 3
-    wake_steps: Annotated[int, Field(ge=1, le=1000)] = 4
     local_landmarks_max: Annotated[int, Field(ge=10, le=1000)] = 150
 
 

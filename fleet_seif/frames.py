@@ -278,7 +278,7 @@ class FramedFilter:
         self._alias(associator.duplicates())
         self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
         near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
-        associator.begin(*near)
+        associator.begin(self.steps, *near)
 
     def _alias(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Landmarks that are one from now on."""
