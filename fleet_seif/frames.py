@@ -274,8 +274,11 @@ class FramedFilter:
 
     def _look_around(self, closed: Closed, associator: Associator) -> None:
         """What lies around the end of a frame that closes, for the next."""
-        solved = self._solved(closed)
         self._alias(associator.duplicates())
+        for other, one in enumerate(first_names(self._own_map.aliases, len(self._names.signatures)).tolist()):
+            if one != other:
+                closed.log.rename(other, one)
+        solved = self._solved(closed)
         self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
         near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
         associator.begin(self.steps, *near)

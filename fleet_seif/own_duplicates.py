@@ -20,10 +20,11 @@ from fleet_seif.merge_records import MergeRules, Reason
 from fleet_seif.records import Floats, Ints
 
 RULES: Final = MergeRules(set_min=3, inflation=1.0, repeat=0.0)
-ALONE_GATE: Final = 9.2
-"""Squared distance up to which a pair by itself is one landmark (chi-square, 2 degrees of freedom: 99 %)."""
+ALONE_GATE: Final = 25.0
+"""Squared distance up to which a pair by itself is one landmark: five standard deviations, since two of a kind that
+were never sighted together are rare, and pairs that are nearer have been joined before."""
 ALONE_SIGMAS: Final = 3.0
-"""A pair by itself counts where so many standard deviations reach at most half way to the next landmark."""
+"""A pair by itself counts where its distance and so many standard deviations reach at most half way to the next one."""
 
 
 def nearest_m(places: Floats, k: int = 1) -> Floats:
@@ -41,19 +42,21 @@ def own_duplicates(
     rows = 3 + 2 * accepted
     S = _differences(local.P, rows[ends])
     d2 = squared_distances(mean[ends[:, 0]] - mean[ends[:, 1]], S)
-    near = np.flatnonzero(d2 <= rules.gate)
+    near = np.flatnonzero(d2 <= max(rules.gate, ALONE_GATE))
     near = near[[not together(int(keys[a]), int(keys[b])) for a, b in ends[near].tolist()]]
     ends, S, d2 = ends[near], S[near], d2[near]
     if not len(ends):
         return []
-    alone = 2.0 * ALONE_SIGMAS * np.sqrt(np.linalg.eigvalsh(S)[:, -1]) <= nearest_m(mean, 2)[ends].min(axis=1)
-    same = alone & (d2 <= ALONE_GATE)
     D = mean[ends[:, 0]] - mean[ends[:, 1]]
+    reach = np.linalg.norm(D, axis=1) + ALONE_SIGMAS * np.sqrt(np.linalg.eigvalsh(S)[:, -1])
+    same = 2.0 * reach <= nearest_m(mean, 2)[ends].min(axis=1)
+    found = [(int(keys[a]), int(keys[b])) for a, b in ends[same].tolist()]
+    ends, D = ends[d2 <= rules.gate], D[d2 <= rules.gate]
     density = np.full(len(ends), 1.0 / (np.pi * np.median(nearest_m(mean)) ** 2))
     pairs = Candidates(D, _joint_differences(local.P, rows[ends]), ends, np.eye(len(keys), dtype=bool), density)
     verdicts, _ = judged(pairs, mean, rules)
-    same |= np.array([verdict is Reason.MERGED for verdict in verdicts], bool)
-    return [(int(keys[a]), int(keys[b])) for a, b in ends[same].tolist()]
+    fits = [verdict is Reason.MERGED for verdict in verdicts]
+    return sorted({*found, *((int(keys[a]), int(keys[b])) for a, b in ends[fits].tolist())})
 
 
 def _differences(P: Floats, rows: Ints) -> Floats:
