@@ -46,6 +46,10 @@ class Keys:
         """Answers with the operator events and the evidence that a node holds."""
         return f"{self._stem}/node/{node}/events"
 
+    def decisions(self, node: str) -> str:
+        """Takes the decision of an operator, and answers what became of it."""
+        return f"{self._stem}/node/{node}/decide"
+
     def map(self, node: str) -> str:
         """A node's maps are put here in pieces, and queried whole; `*` for all nodes."""
         return f"{self._stem}/node/{node}/map"

@@ -102,7 +102,7 @@ class _Search:
             if a in part_of and b in part_of:
                 self._part(part_of[a], part_of[b])
         self.groups: list[tuple[int, ...]] = [(p,) for p in range(len(parts))]
-        self.dropped: dict[tuple[int, int], Reason] = {}
+        self.dropped: dict[tuple[int, int], tuple[float, Reason]] = {}
 
     @property
     def anything_to_decide(self) -> bool:
@@ -145,7 +145,7 @@ class _Search:
                 for q in group[i + 1 :]:
                     if q not in before[p]:
                         self._part(p, q)
-                        self.dropped[min(p, q), max(p, q)] = Reason.UNSOLVED
+                        self.dropped[min(p, q), max(p, q)] = (np.inf, Reason.UNSOLVED)
         self.groups = last
 
     def _classes(self) -> Classes:
@@ -163,10 +163,9 @@ class _Search:
 
     def _take_out(self, now: _Map, tested: LeftOut) -> bool:
         """Take out of their landmarks the parts that fail their test by themselves; of several the worst ones."""
-        automatic = self._automatic(now)
-        d2 = np.where(automatic[tested.landmark], tested.d2, 0.0)
+        d2 = tested.d2
         gain = cautious(d2, tested.S, now.density[tested.landmark], self.rules)
-        bad = (d2 > self.rules.gate) | (automatic[tested.landmark] & (gain < self.rules.pair_gain))
+        bad = (d2 > self.rules.gate) | (gain < self.rules.pair_gain)
         if not np.any(bad):
             return False
         worst = bad & ((d2 >= 0.5 * d2[bad].max()) | (d2 <= self.rules.gate))
@@ -179,13 +178,10 @@ class _Search:
             rest = tuple(q for q in now.groups[c] if q != p)
             for q in rest:
                 self._part(p, q)
-                self.dropped[min(p, q), max(p, q)] = Reason.CONTRADICTED if d2[i] > self.rules.gate else Reason.CROWDED
+                reason = Reason.CONTRADICTED if d2[i] > self.rules.gate else Reason.CROWDED
+                self.dropped[min(p, q), max(p, q)] = (float(d2[i]), reason)
             self.groups = sorted([g for g in self.groups if g != now.groups[c]] + [(p,), rest])
         return True
-
-    def _automatic(self, now: _Map) -> Bools:
-        """Which landmarks are made of several parts."""
-        return np.array([len(group) > 1 for group in now.groups], bool)
 
     def _near(self, now: _Map) -> Near:
         """Pairs that may be merged, within gate and margin of each other."""
@@ -277,6 +273,6 @@ class _Search:
                 one, other = sorted((now.solution.classes[a][0], now.solution.classes[b][0]))
                 kept = Reason.AMBIGUOUS if reason is Reason.MERGED else reason
                 considered.append(Considered(one, other, d2, kept))
-        for (p, q), reason in self.dropped.items():
-            considered.append(Considered(self.parts[p][0], self.parts[q][0], float("nan"), reason))
+        for (p, q), (d2, reason) in self.dropped.items():
+            considered.append(Considered(self.parts[p][0], self.parts[q][0], d2, reason))
         return Merges(self._classes(), tuple(sorted(pairs)), tuple(sorted(considered, key=lambda e: e[:2])))

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from fleet_seif.config import FusionSettings
 from fleet_seif.envelope import KIND_EVENT, KIND_HEARTBEAT, SEQUENCE_MAX, authenticate, kind_of
 from fleet_seif.errors import WireError
-from fleet_seif.messages import Ack, Epoch, NodeStatus, RangeRequest, StreamPosition, VehicleState
-from fleet_seif.node_wire import decode_status, encode_status
+from fleet_seif.messages import Ack, Epoch, NodeStatus, OperatorEvent, RangeRequest, StreamPosition, VehicleState
+from fleet_seif.node_wire import decode_event, decode_status, encode_status
 from fleet_seif.signing import KeyRing, Role, Signer
 from fleet_seif.wire import decode_heartbeat, decode_range, encode_ack, encode_range
 from fusion.compaction import compact
@@ -32,6 +32,8 @@ QUERY_LOST_S = 4.0
 REPLY_BYTES_MAX = 4 * 2**20
 ANNOUNCED_MAX = 8
 NODES_MAX = 100
+TAKEN, REFUSED = "+", "-"
+"""How the answer to an operator's decision begins."""
 
 
 @dataclass(frozen=True)
@@ -263,6 +265,30 @@ class FusionCore:
             return self._malformed(node, error)
         self.changed = self.changed or news
         return []
+
+    def on_decision(self, data: bytes) -> str:
+        """The decision of an operator, from the operator: TAKEN and what it means here, or REFUSED and why."""
+        try:
+            event = decode_event(data)
+            self.changed = self.ledger.accept_event(data) or self.changed
+            if self.ledger.events.get((event.number, event.operator)) != data:
+                raise WireError("another decision has taken its number meanwhile: decide again")
+        except WireError as error:
+            self._malformed("operator", error)
+            return f"{REFUSED}{self.node}: {error}"
+        return f"{TAKEN}{self.words_of(event)}"
+
+    def words_of(self, event: OperatorEvent) -> str:
+        """What a decision means in this ledger, in a sentence."""
+        known = {(s.vehicle, s.number): s.life for s in self.ledger.streams.values() if s.life is not None}
+        subject = event.vehicle or " ".join("/".join(map(str, name)) for name in event.landmarks or ())
+        unknown = [] if not event.vehicle or any(v == event.vehicle for v, _ in known) else [event.vehicle]
+        for name in event.landmarks or ():
+            life = known.get(name[:2])
+            if life is None or name.number >= len(life.signatures):
+                unknown.append("/".join(map(str, name)))
+        words = f"{self.node}: {event.action} {subject}, decision {event.number} of {event.operator}"
+        return words + (f"; nothing is known yet of {' and '.join(unknown)}" if unknown else "")
 
     def answer_events(self) -> list[bytes]:
         """All decisions of operators and all evidence, for another node."""

@@ -24,7 +24,7 @@ from fleet_seif.keys import Keys, node_of, vehicle_of
 from fleet_seif.map_wire import encode_map, map_pieces
 from fleet_seif.messages import Epoch, JointMap
 from fleet_seif.signing import Signer
-from fleet_seif.store import Put, Store, StoreError
+from fleet_seif.store import Change, Put, Store, StoreError
 from fusion import records
 from fusion.core import AskEvents, AskRange, Effect, FusionCore, PutAck, PutStatus
 from fusion.inbox import Inbox
@@ -107,6 +107,7 @@ class FusionService:
         self._keys = Keys(core.ledger.fleet)
         self._inbox: Inbox[Event] = Inbox()
         self._lock = threading.Lock()
+        self._commit_lock = threading.Lock()
         self._stop = threading.Event()
         self._over = threading.Event()
         self._alive: set[str] = set()
@@ -123,6 +124,7 @@ class FusionService:
         bus.watch(keys.alive("*"), self._on_alive)
         bus.answer(keys.ledger("*"), self._on_range)
         bus.answer(keys.events(core.node), self._on_events_asked)
+        bus.answer(keys.decisions(core.node), self._on_decision)
         self._maps.answer(keys.map(core.node), lambda key, data: [self._served] if self._served else [])
         self._maps.announce(keys.node_alive(core.node))
 
@@ -152,6 +154,18 @@ class FusionService:
     def _on_events_asked(self, key: str, data: bytes) -> list[bytes]:
         with self._lock:
             return self._core.answer_events()
+
+    def _on_decision(self, key: str, data: bytes) -> list[bytes]:
+        """Answered only once it is on disk. What it changes is apart from what a round of `_work` commits."""
+        with self._lock:
+            said = self._core.on_decision(data)
+            self._commit(self._core.ledger.take_changes())
+        return [said.encode()]
+
+    def _commit(self, changes: list[Change]) -> None:
+        if self._store is not None and changes:
+            with self._commit_lock:
+                self._store.commit(changes)
 
     def run(self, on_progress: Callable[[FusionCore], None] | None = None) -> JointMap:
         """Work until every expected vehicle has ended and is folded, or until `stop`."""
@@ -208,8 +222,7 @@ class FusionService:
             changes = self._core.ledger.take_changes()
             if self._changed_at_s is None and self._core.changed:
                 self._changed_at_s = self._clock()
-        if self._store is not None and changes:
-            self._store.commit(changes)
+        self._commit(changes)
         for effect in effects:
             self._execute(effect)
 

@@ -59,7 +59,7 @@ def access_of(fleet: str, member: Member) -> Access:
             watches=(nodes,),
         )
     if member.kind is Kind.OPERATOR:
-        asks = (maps, keys.events("*"))
+        asks = (maps, keys.events("*"), keys.decisions("*"))
         return Access(subscribes=(maps, keys.status("*")), asks=asks, watches=(nodes, vehicles))
     return Access(subscribes=(maps,), asks=(maps,), watches=(nodes, vehicles))
 

@@ -15,9 +15,9 @@ from rich.logging import RichHandler
 
 from fleet_seif.bus import open_bus
 from fleet_seif.errors import NumericalError, RunError
-from fleet_seif.messages import check_name
+from fleet_seif.messages import Action, check_name
 from fleet_seif.warm_up import warm_up
-from scenarios import chaos_runs, children, output, tools, watch
+from scenarios import chaos_runs, children, decisions, output, tools, watch
 from scenarios.access import Kind
 from scenarios.batch import STAGES
 from scenarios.config import ScenarioError, load_scenario, shipped
@@ -273,6 +273,85 @@ def status(
     """Say once how every vehicle of a fleet is, and why one is quarantined."""
     source = watch.Source(_endpoints(endpoint, config), fleet, config, insecure, key_ring)
     tools.show_status(source, as_json, console)
+
+
+ConnectOption = Annotated[list[str] | None, typer.Option(help="Fusion nodes; tcp/127.0.0.1:7447 by default.")]
+OperatorOption = Annotated[str, typer.Option(help="Who decides; with --signing-key its name counts.")]
+DownOption = Annotated[
+    Path | None, typer.Option("--store", metavar="FILE", exists=True, dir_okay=False, help="Of a node that is down.")
+]
+LandmarkArgument = Annotated[
+    str, typer.Argument(metavar="VEHICLE/LIFE/NUMBER", help="A landmark, as 'watch' names it.")
+]
+
+
+@app.command()
+@_clear_errors()
+def merge(
+    one: LandmarkArgument,
+    other: LandmarkArgument,
+    undo: Annotated[bool, typer.Option("--undo", help="Leave it to what is seen again.")] = False,
+    connect: ConnectOption = None,
+    fleet: NamedFleetOption = "fleet",
+    operator: OperatorOption = "operator",
+    store: DownOption = None,
+    config: ConfigOption = None,
+    insecure: InsecureOption = False,
+    signing_key: SigningKeyOption = None,
+) -> None:
+    """Decide that two landmarks are one. Lasts until it is undone, on every node."""
+    action = Action.RELEASE if undo else Action.FORCE
+    desk = _desk(connect, fleet, operator, store, config, insecure, signing_key)
+    decisions.decide(desk, decisions.about_landmarks(action, one, other), console)
+
+
+@app.command()
+@_clear_errors()
+def split(
+    one: LandmarkArgument,
+    other: LandmarkArgument,
+    undo: Annotated[bool, typer.Option("--undo", help="Leave it to what is seen again.")] = False,
+    connect: ConnectOption = None,
+    fleet: NamedFleetOption = "fleet",
+    operator: OperatorOption = "operator",
+    store: DownOption = None,
+    config: ConfigOption = None,
+    insecure: InsecureOption = False,
+    signing_key: SigningKeyOption = None,
+) -> None:
+    """Decide that two landmarks are two. Lasts until it is undone, on every node."""
+    action = Action.RELEASE if undo else Action.FORBID
+    desk = _desk(connect, fleet, operator, store, config, insecure, signing_key)
+    decisions.decide(desk, decisions.about_landmarks(action, one, other), console)
+
+
+@app.command()
+@_clear_errors()
+def retract(
+    vehicle: Annotated[str, typer.Argument(help="Its name.")],
+    undo: Annotated[bool, typer.Option("--undo", help="Take it into the map again.")] = False,
+    connect: ConnectOption = None,
+    fleet: NamedFleetOption = "fleet",
+    operator: OperatorOption = "operator",
+    store: DownOption = None,
+    config: ConfigOption = None,
+    insecure: InsecureOption = False,
+    signing_key: SigningKeyOption = None,
+) -> None:
+    """Leave all that a vehicle has said, and will say, out of the map; it is kept, and can come back."""
+    action = Action.RESTORE if undo else Action.RETRACT
+    desk = _desk(connect, fleet, operator, store, config, insecure, signing_key)
+    decisions.decide(desk, decisions.about_vehicle(action, vehicle), console)
+
+
+def _desk(
+    connect: list[str] | None, fleet: str, operator: str, store: Path | None, config: Path | None, insecure: bool,
+    signing_key: Path | None,
+) -> decisions.Desk:  # fmt: skip
+    return decisions.Desk(
+        endpoints=_endpoints(connect, config), fleet=fleet, operator=_checked_name(operator, "operator"), store=store,
+        signing_key=signing_key, config=config, insecure=insecure,
+    )  # fmt: skip
 
 
 @ledger.command()

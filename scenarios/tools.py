@@ -65,7 +65,7 @@ def members_of(nodes: list[str], endpoints: list[str], hosts: list[str], named: 
     return members + [Member(kind=kind, name=name) for kind, names in named.items() for name in names]
 
 
-def _whose(file: Path) -> tuple[str, str]:
+def whose(file: Path) -> tuple[str, str]:
     store = SqliteStore.open(file, records.KIND, records.SCHEMA, read_only=True)
     try:
         found = dict(store.load(records.IDENTITY, records.IDENTITY + b"\0"))
@@ -79,7 +79,7 @@ def _whose(file: Path) -> tuple[str, str]:
 
 def ledger_info(file: Path, console: Console) -> Ledger:
     """Print what a store holds; every message is folded again."""
-    fleet, node = _whose(file)
+    fleet, node = whose(file)
     ledger = output.read_ledger(file, fleet)
     table = Table(box=None)
     for head in ("vehicle", "life", "epoch", "messages", "bytes", "up to", "checked", "state"):
@@ -95,10 +95,20 @@ def ledger_info(file: Path, console: Console) -> Ledger:
         soft_wrap=True,
     )
     console.print(table)
+    for text in decision_words(ledger):
+        console.print(text, highlight=False, soft_wrap=True)
     console.print(
         f"map digest    {run_digest(ledger).hex()}\nledger digest {ledger.ledger_digest().hex()}", highlight=False
     )
     return ledger
+
+
+def decision_words(ledger: Ledger) -> list[str]:
+    """The decisions of operators that count, a line each."""
+    pairs = [("forced", pair) for pair in ledger.decisions.forced]
+    pairs += [("forbidden", pair) for pair in ledger.decisions.forbidden]
+    words = [f"{what} {' '.join('/'.join(map(str, name)) for name in pair)}" for what, pair in pairs]
+    return words + [f"retracted {vehicle}" for vehicle in sorted(ledger.decisions.retracted)]
 
 
 def ledger_verify(file: Path, key_ring: Path | None, console: Console) -> None:
@@ -137,7 +147,7 @@ def ledger_compact(file: Path, signing_key: Path | None, console: Console) -> No
 
     Raises RunError where the messages are signed and the node's key is not given: nobody would take its snapshots.
     """
-    fleet, node = _whose(file)
+    fleet, node = whose(file)
     signer = signer_of(signing_key, fleet, Role.NODE, node)
     held = [data for stream in output.read_ledger(file, fleet).streams.values() for data in stream.log]
     if signer is None and any(is_signed(data) for data in held):

@@ -128,3 +128,16 @@ def test_what_is_not_signed_is_counted_and_changes_nothing(keys: Path, tmp_path:
     assert [state["name"] for state in joint["vehicles"]] == ["v1"]
     ledger = read_ledger(fleet.store("fusion"), FLEET)
     assert {name for name, _ in ledger.streams} == {"v1"}
+
+
+def test_an_operator_decides_with_the_operators_key_and_nobody_else_does(finished: Secured, keys: Path) -> None:
+    where = ["--connect", finished.node.endpoint, "--fleet", FLEET]
+    config = ["--config", str(keys / "operator-ops.json5")]
+    signed = [*config, "--signing-key", str(keys / "operator-ops.key.json")]
+    for undo in ([], ["--undo"]):
+        done = invoke("retract", "v2", *undo, *where, *signed)
+        assert done.exit_code == 0, done.stderr
+        assert "of ops" in done.stdout
+    assert "not signed" in refused(1, "retract", "v2", *where, *config)
+    viewer = ["--config", str(keys / "viewer-screen.json5")]
+    assert "may you ask it?" in refused(1, "retract", "v2", *where, *viewer)

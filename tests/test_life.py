@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from fleet_seif.information import H_QUANTUM, FrameDelta, delta_digest, to_information
 from fleet_seif.messages import DeltaMessage, FrameStatus
-from fleet_seif.streams import is_check_point
-from fusion.life import LifeTotal
+from fleet_seif.streams import Coalescer, is_check_point
+from fusion.life import Checked, LifeTotal
 from tests import strategies
 from tests.histories import CONTINUED, CORRECTED, ENDED, HELLO, HONEST, MAIN, OPENED, instead, part
 from tests.reference import summed
@@ -143,3 +144,71 @@ def test_a_check_can_be_asked_for_anywhere() -> None:
     assert not is_check_point(second)
     assert life.fold(second, check=True) is None
     assert life.checked.names == 2
+
+
+@st.composite
+def said_aliases(draw: st.DrawFn) -> list[tuple[tuple[int, int, bool], ...]]:
+    """What a vehicle with five landmarks says about pairs of them, in each of six messages."""
+    numbers = st.integers(0, 4)
+    pairs = st.tuples(numbers, numbers, st.booleans()).filter(lambda item: item[0] != item[1])
+    return draw(st.lists(st.lists(pairs, max_size=3).map(tuple), min_size=6, max_size=6))
+
+
+def with_aliases(said: list[tuple[tuple[int, int, bool], ...]]) -> list[DeltaMessage]:
+    messages = HONEST["ann", MAIN][:6]
+    five = tuple((k, -1) for k in range(5))
+    changed = [
+        dataclasses.replace(m, aliases=aliases, landmarks=(), innovation=0.1 * k + 0.3, innovation_dof=2 * k)
+        for k, (m, aliases) in enumerate(zip(messages, said, strict=True))
+    ]  # fmt: skip
+    changed[0] = dataclasses.replace(changed[0], landmarks=five)
+    return changed
+
+
+@given(said_aliases())
+@settled
+def test_an_alias_counts_until_it_is_taken_back(said: list[tuple[tuple[int, int, bool], ...]]) -> None:
+    messages = with_aliases(said)
+    life = lived(messages)
+    held: set[frozenset[int]] = set()
+    for message in messages:
+        for a, b, added in message.aliases:
+            (held.add if added else held.discard)(frozenset((a, b)))
+    assert {frozenset(pair) for pair in life.newest.aliases} == held
+    assert list(life.newest.aliases) == sorted(life.newest.aliases)
+    assert life.checked.aliases == life.newest.aliases  # message 5 is a check point
+
+
+@given(said_aliases(), st.integers(1, 5))
+@settled
+def test_several_messages_as_one_leave_the_same_aliases_and_innovations_to_the_bit(
+    said: list[tuple[tuple[int, int, bool], ...]], count: int
+) -> None:
+    messages = with_aliases(said)
+    whole = Coalescer(messages[0])
+    for message in messages[1:count]:
+        whole.add(message)
+    one, other = lived(messages), LifeTotal()
+    assert other.fold(whole.message(), check=True) is None
+    for message in messages[count:]:
+        assert other.fold(message) is None
+    for a, b in ((one.newest, other.newest), (one.checked, other.checked)):
+        assert (a.aliases, a.innovation.hex(), a.dof) == (b.aliases, b.innovation.hex(), b.dof)
+
+
+def test_a_message_that_is_refused_leaves_no_alias() -> None:
+    life = lived(with_aliases([()] * 6)[:1])
+    wrong = dataclasses.replace(HONEST["ann", MAIN][1], aliases=((0, 1, True), (0, 9, True)), landmarks=())
+    assert "an alias of a landmark" in str(life.fold(wrong))
+    assert life.newest.aliases == ()
+
+
+@pytest.mark.parametrize(("mean", "fits"), [(1.0, True), (1.4, True), (1.7, False), (10.0, False)])
+def test_a_vehicle_whose_innovations_are_far_larger_than_it_says_is_not_consistent(mean: float, fits: bool) -> None:
+    dof = 2000
+    assert Checked(innovation=mean * dof, dof=dof).consistent is fits
+
+
+def test_before_anything_is_sighted_again_a_vehicle_counts_as_consistent() -> None:
+    assert Checked().consistent
+    assert Checked(innovation=12.0, dof=2).consistent
