@@ -37,7 +37,7 @@ from fleet_seif.local_map import (
     with_new,
 )
 from fleet_seif.models import COMPASS_XY
-from fleet_seif.own_duplicates import own_duplicates
+from fleet_seif.own_duplicates import Duplicates, own_duplicates
 from fleet_seif.records import Floats, Ints
 
 DOUBTFUL_SIGMAS: Final = 3.0
@@ -153,7 +153,7 @@ class Associator:
         """Whether this pose in the frame is so far from its start that the local map may lack what is sighted."""
         return bool(np.hypot(pose[0], pose[1]) >= self.travel_max_m)
 
-    def duplicates(self) -> list[tuple[int, int]]:
+    def duplicates(self) -> Duplicates:
         """Landmarks that have been begun twice (rule 3): pairs of keys."""
         return own_duplicates(self.local, lambda a, b: self._together[min(a, b), max(a, b)] >= TOGETHER_LEAST)
 

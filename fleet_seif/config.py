@@ -34,6 +34,8 @@ class AssociationSettings(Settings):
     nodes_max: partial hypotheses looked at after which the best so far is taken, and again for all rivals together.
     confirm_sightings, confirm_steps: a new landmark is provisional until it has been sighted so many times within so
     many steps, the first included; else it is forgotten: clutter, or something that moves.
+    unclear_max, misfit_max: a vehicle says that it is doubtful while a larger share of the landmarks around may be
+    another one, or while chi-square per row of its frames is larger.
     local_landmarks_max: landmarks around the start of a frame that sightings are compared with; where there are more, a
     frame closes before the vehicle leaves them behind.
 
@@ -50,6 +52,8 @@ class AssociationSettings(Settings):
     nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 500
     confirm_sightings: Annotated[int, Field(ge=1, le=100)] = 3
     confirm_steps: Annotated[int, Field(ge=1, le=1000)] = 8
+    unclear_max: Probability = 0.15
+    misfit_max: Positive = 1.15
     local_landmarks_max: Annotated[int, Field(ge=10, le=1000)] = 150
 
 

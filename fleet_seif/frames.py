@@ -10,7 +10,9 @@
    owns the filter calls `localise` after a step. Between two solutions the open frame's filter goes on from there.
 6. With frames = "single" there is one, which closes at the end and is never corrected.
 7. Where nothing tells which landmark a sighting is of (identities = "associated"), an Associator decides, against what
-   the closed frames say about where the open one starts and what lies around it (own_map).
+   the closed frames say about where the open one starts and what lies around it (own_map). Where too many landmarks may
+   be another one, or the frames do not fit each other, the vehicle has probably taken some for their neighbours: it is
+   doubtful until a frame closes after which neither is so.
 """
 
 import dataclasses
@@ -66,7 +68,7 @@ class Closed:
 
 
 class FramedFilter:
-    """See the rules above."""
+    """See the rules above. doubtful: when the last frame closed, this vehicle's map did not look right (rule 7)."""
 
     def __init__(self, settings: FilterSettings, model: int = RANGE_BEARING) -> None:
         self.settings = settings
@@ -87,6 +89,7 @@ class FramedFilter:
         self._closed: list[Closed] = []
         self._associator = Associator(settings.association, model) if settings.identities == "associated" else None
         self._own_map = OwnMap()
+        self.doubtful = False
         self._new_aliases: list[tuple[int, int, bool]] = []
         self._assigned: list[Ints] = []
         self._open()
@@ -274,7 +277,8 @@ class FramedFilter:
 
     def _look_around(self, closed: Closed, associator: Associator) -> None:
         """What lies around the end of a frame that closes, for the next."""
-        self._alias(associator.duplicates())
+        duplicates = associator.duplicates()
+        self._alias(duplicates.pairs)
         for other, one in enumerate(first_names(self._own_map.aliases, len(self._names.signatures)).tolist()):
             if one != other:
                 closed.log.rename(other, one)
@@ -282,6 +286,8 @@ class FramedFilter:
         self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
         near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
         associator.begin(self.steps, *near)
+        limits = self.settings.association
+        self.doubtful = duplicates.unclear > limits.unclear_max or self._own_map.misfit > limits.misfit_max
 
     def _alias(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Landmarks that are one from now on."""
@@ -369,7 +375,7 @@ class FramedFilter:
         return {
             **state, "signatures": self._names.signatures, "log": self._log.state(), "closed": closed,
             "totals": [pack_delta(total.delta()) for total in self.totals],
-            "aliases": self._own_map.aliases, "new_aliases": self._new_aliases,
+            "doubtful": self.doubtful, "aliases": self._own_map.aliases, "new_aliases": self._new_aliases,
             "own": [pack_delta(delta) for delta in self._own_map.frames], "ends": np.array(self.ends).tobytes(),
         }  # fmt: skip
 
@@ -397,6 +403,7 @@ class FramedFilter:
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
+        self.doubtful = state["doubtful"]
         self._own_map.aliases = [(a, b) for a, b in state["aliases"]]
         self._new_aliases = [(a, b, added) for a, b, added in state["new_aliases"]]
         self._own_map.frames = [read_delta(data) for data in state["own"]]

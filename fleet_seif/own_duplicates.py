@@ -7,7 +7,7 @@ so well known that it cannot be taken for a neighbour.
 """
 
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy.spatial
@@ -23,6 +23,8 @@ RULES: Final = MergeRules(set_min=3, inflation=1.0, repeat=0.0)
 ALONE_GATE: Final = 25.0
 """Squared distance up to which a pair by itself is one landmark: five standard deviations, since two of a kind that
 were never sighted together are rare, and pairs that are nearer have been joined before."""
+PAIRS_MAX: Final = 128
+"""Pairs that are looked at, the nearest first."""
 ALONE_SIGMAS: Final = 3.0
 """A pair by itself counts where its distance and so many standard deviations reach at most half way to the next one."""
 
@@ -32,10 +34,15 @@ def nearest_m(places: Floats, k: int = 1) -> Floats:
     return np.asarray(scipy.spatial.KDTree(places).query(places, [k + 1])[0])[:, 0] if len(places) else np.empty(0)
 
 
-def own_duplicates(
-    local: LocalMap, together: Callable[[int, int], bool], rules: MergeRules = RULES
-) -> list[tuple[int, int]]:
-    """Pairs of keys that are one landmark. together: whether two have been sighted from one pose."""
+class Duplicates(NamedTuple):
+    """pairs: keys that are one landmark. unclear: share of landmarks that may be another one, and could not be told."""
+
+    pairs: list[tuple[int, int]]
+    unclear: float
+
+
+def own_duplicates(local: LocalMap, together: Callable[[int, int], bool], rules: MergeRules = RULES) -> Duplicates:
+    """Landmarks of a map that are one. together: whether two have been sighted from one pose."""
     accepted = np.flatnonzero(local.keys >= 0)
     mean, keys = local.landmarks[accepted], local.keys[accepted]
     ends = np.stack(np.triu_indices(len(keys), 1), axis=1)
@@ -44,9 +51,10 @@ def own_duplicates(
     d2 = squared_distances(mean[ends[:, 0]] - mean[ends[:, 1]], S)
     near = np.flatnonzero(d2 <= max(rules.gate, ALONE_GATE))
     near = near[[not together(int(keys[a]), int(keys[b])) for a, b in ends[near].tolist()]]
+    near = near[np.argsort(d2[near], kind="stable")[:PAIRS_MAX]]
     ends, S, d2 = ends[near], S[near], d2[near]
     if not len(ends):
-        return []
+        return Duplicates([], 0.0)
     D = mean[ends[:, 0]] - mean[ends[:, 1]]
     reach = np.linalg.norm(D, axis=1) + ALONE_SIGMAS * np.sqrt(np.linalg.eigvalsh(S)[:, -1])
     same = 2.0 * reach <= nearest_m(mean, 2)[ends].min(axis=1)
@@ -56,7 +64,9 @@ def own_duplicates(
     pairs = Candidates(D, _joint_differences(local.P, rows[ends]), ends, np.eye(len(keys), dtype=bool), density)
     verdicts, _ = judged(pairs, mean, rules)
     fits = [verdict is Reason.MERGED for verdict in verdicts]
-    return sorted({*found, *((int(keys[a]), int(keys[b])) for a, b in ends[fits].tolist())})
+    pairs = sorted({*found, *((int(keys[a]), int(keys[b])) for a, b in ends[fits].tolist())})
+    unclear = {int(keys[i]) for i in ends.ravel()} - {key for pair in pairs for key in pair}
+    return Duplicates(pairs, len(unclear) / len(keys))
 
 
 def _differences(P: Floats, rows: Ints) -> Floats:

@@ -19,11 +19,13 @@ TRAVEL_LEAST: Final = 0.25
 
 
 class OwnMap:
-    """See above. Frames are numbered from 0 on. aliases: pairs of landmarks that are one, the lesser number first."""
+    """See above. Frames are numbered from 0 on. aliases: pairs of landmarks that are one, the lesser number first.
+    misfit: chi-square per degree of freedom of all frames, when `around` was called last."""
 
     def __init__(self) -> None:
         self.frames: list[FrameDelta] = []
         self.aliases: list[tuple[int, int]] = []
+        self.misfit = 0.0
         self._solver = JointSolver()
 
     def put(self, frame: int, total: FrameDelta) -> None:
@@ -44,6 +46,7 @@ class OwnMap:
             signatures=(UNKNOWN_SIGNATURE,) * last, aliases=tuple(sorted(self.aliases)),
         )  # fmt: skip
         solution = self._solver.update([life], landmark_classes([life]))
+        self.misfit = float(solution.chi_square.sum() / max(int(solution.dof.sum()), 1))
         newest = [k for _, _, k in solution.poses].index(-1)
         pose, landmarks = solution.pose_mean[newest], solution.landmark_mean
         away = np.hypot(*(landmarks - pose[:2]).T)

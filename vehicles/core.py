@@ -3,7 +3,8 @@
 1. One reading is one message; sequence 0 is the hello with what is seen before any motion.
 2. Time is the vehicle's own and grows from reading to reading; others are refused and change nothing.
 3. Nothing of the joint map ever enters the filter (DESIGN D4).
-4. Once the filter has refused a reading for numerical reasons the vehicle says that it is not healthy.
+4. Once the filter has refused a reading for numerical reasons the vehicle says that it is not healthy, and so it does
+   while its map is doubtful (fleet_seif.frames).
 5. What has been committed outlives the process: `resume` goes on, in a new epoch that continues the last one, exactly
    where the last committed step ended, or begins a fresh life. The earlier epochs stay open for repair.
 6. Nothing is put before it is committed: `take_changes`, commit, `note_commit`, `release`.
@@ -256,7 +257,7 @@ class VehicleCore:
         self.filter.take_aliases()  # they have been published
         newest = self.outbox.newest
         if newest is not None:
-            self.healthy = newest.healthy
+            self.healthy = newest.healthy or self.filter.doubtful
         if self.outbox.ended:
             self.filter.end()  # what it published then has been published
 
@@ -404,7 +405,7 @@ class VehicleCore:
         self.outbox.append(
             DeltaMessage(
                 fleet=identity.fleet, vehicle=identity.vehicle, epoch=identity.epoch, first=number, last=number,
-                step=self.steps, healthy=self.healthy, **fields,  # type: ignore[arg-type]
+                step=self.steps, healthy=self.healthy and not self.filter.doubtful, **fields,  # type: ignore[arg-type]
             )
         )  # fmt: skip
 
