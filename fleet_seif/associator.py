@@ -42,6 +42,8 @@ from fleet_seif.records import Floats, Ints
 
 DOUBTFUL_SIGMAS: Final = 3.0
 """A landmark is told from its neighbour where so many standard deviations reach at most half way to it."""
+LIFETIMES: Final = 10
+"""A provisional landmark out of reach is kept for so many times `confirm_steps`."""
 TOGETHER_LEAST: Final = 2
 """Poses from which two landmarks must have been sighted to be two: once may be clutter."""
 REACH_SIGMAS: Final = 4.0
@@ -50,10 +52,12 @@ REACH_SIGMAS: Final = 4.0
 
 @dataclass(frozen=True)
 class Provisional:
-    """A landmark that has not been accepted. born: the step of its first sighting."""
+    """A landmark that has not been accepted. born: the step of its first sighting. chances: steps, from that one on, in
+    which it was within reach."""
 
     born: int
     sightings: int
+    chances: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +112,14 @@ class Associator:
         provisional, key = dict(self._provisional), self._next
         for i in np.flatnonzero(found.verdict == Verdict.NEW).tolist():
             local = with_new(self.model, local, key, z[i], Z[i])
-            keys[i], provisional[key] = key, Provisional(step, 0)
+            keys[i], provisional[key] = key, Provisional(step, 0, 0)
             key -= 1
-        for each in keys[keys < NONE].tolist():
-            provisional[each] = Provisional(provisional[each].born, provisional[each].sightings + 1)
+        within = set(local.keys[in_reach(local.mean, local.P, self.reach_m, 0.0)].tolist())
+        for each, known_of in provisional.items():
+            seen = each in keys
+            provisional[each] = Provisional(
+                known_of.born, known_of.sightings + seen, known_of.chances + (seen or each in within)
+            )
         return self._settled(step, known, Decision(keys, {}, squared, 2 * len(paired), local, provisional, key))
 
     def _is_doubtful(self, local: LocalMap, i: int, step: int) -> bool:
@@ -128,7 +136,8 @@ class Associator:
             if made.provisional[key].sightings >= settings.confirm_sightings:
                 accepted[key] = known + len(accepted)
         for key, each in made.provisional.items():
-            if key not in accepted and step - each.born >= settings.confirm_steps - 1:
+            old = step - each.born >= LIFETIMES * settings.confirm_steps
+            if key not in accepted and (old or each.chances >= settings.confirm_steps):
                 gone.add(key)
         for key in (*accepted, *gone):
             del made.provisional[key]
@@ -188,7 +197,7 @@ class Associator:
             "began": self._began, "travel": self.travel_max_m, "reach": self.reach_m,
             "last": list(self._last.items()), "together": [(*pair, count) for pair, count in self._together.items()],
             "apart": list(self._apart.items()),
-            "provisional": [(key, each.born, each.sightings) for key, each in self._provisional.items()],
+            "provisional": [(key, each.born, each.sightings, each.chances) for key, each in self._provisional.items()],
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -200,7 +209,7 @@ class Associator:
         self._began = state["began"]
         self._last, self._apart = dict(state["last"]), dict(state["apart"])
         self._together = Counter({(a, b): count for a, b, count in state["together"]})
-        self._provisional = {key: Provisional(born, sightings) for key, born, sightings in state["provisional"]}
+        self._provisional = {key: Provisional(*rest) for key, *rest in state["provisional"]}
 
 
 def beside(a: LocalMap, b: LocalMap) -> LocalMap:

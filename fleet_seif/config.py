@@ -33,7 +33,7 @@ class AssociationSettings(Settings):
     birth_gate_probability: chance that a landmark's own sighting is within the gate in which none is born beside it.
     nodes_max: partial hypotheses looked at after which the best so far is taken, and again for all rivals together.
     confirm_sightings, confirm_steps: a new landmark is provisional until it has been sighted so many times within so
-    many steps, the first included; else it is forgotten: clutter, or something that moves.
+    many steps in which it was within reach, the first included; else it is forgotten: clutter, or something that moves.
     unclear_max, misfit_max: a vehicle says that it is doubtful while a larger share of the landmarks around may be
     another one, or while chi-square per row of its frames is larger.
     local_landmarks_max: landmarks around the start of a frame that sightings are compared with; where there are more, a

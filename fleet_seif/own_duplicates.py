@@ -61,8 +61,8 @@ def own_duplicates(local: LocalMap, together: Callable[[int, int], bool], rules:
     found = [(int(keys[a]), int(keys[b])) for a, b in ends[same].tolist()]
     ends, D = ends[d2 <= rules.gate], D[d2 <= rules.gate]
     density = np.full(len(ends), 1.0 / (np.pi * np.median(nearest_m(mean)) ** 2))
-    pairs = Candidates(D, _joint_differences(local.P, rows[ends]), ends, np.eye(len(keys), dtype=bool), density)
-    verdicts, _ = judged(pairs, mean, rules)
+    candidates = Candidates(D, _joint_differences(local.P, rows[ends]), ends, np.eye(len(keys), dtype=bool), density)
+    verdicts, _ = judged(candidates, mean, rules)
     fits = [verdict is Reason.MERGED for verdict in verdicts]
     pairs = sorted({*found, *((int(keys[a]), int(keys[b])) for a, b in ends[fits].tolist())})
     unclear = {int(keys[i]) for i in ends.ravel()} - {key for pair in pairs for key in pair}
