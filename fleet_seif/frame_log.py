@@ -15,7 +15,7 @@ from fleet_seif.seif import Taken
 NONE: Final = -1
 """Signature of a sighting of which it is not known what it is of."""
 AGAIN_GATE: Final = 11.0
-"""Squared residual up to which a sighting is of a landmark when the frame is known (chi-square, 2 degrees of freedom)."""
+"""Squared residual up to which a sighting is of a landmark when the frame is known (chi-square of two: 99.6 %)."""
 AGAIN_MARGIN: Final = 6.0
 """By how much the next best landmark has to fit worse."""
 

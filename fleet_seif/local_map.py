@@ -89,7 +89,7 @@ def _seen(spread: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
 
 @kernel
 def expected(model: int, mean: Floats, P: Floats, which: Ints) -> tuple[Floats, Floats]:
-    """Sightings of these landmarks: expected h (c, 2), their joint covariance J P J' (2 c, 2 c) without sensor noise."""
+    """Sightings of these landmarks: expected h (c, 2), their joint covariance J P J' (2 c, 2 c) without noise."""
     h, J_x, J_y = _blocks(model, mean, which)
     return h, _seen(_spread(P, which, J_x, J_y), which, J_x, J_y)
 
