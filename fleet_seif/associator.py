@@ -39,6 +39,8 @@ from fleet_seif.local_map import (
 from fleet_seif.models import COMPASS_XY
 from fleet_seif.own_duplicates import Duplicates, own_duplicates
 from fleet_seif.records import Floats, Ints
+from fleet_seif.seif import FAULTS
+from fleet_seif.seif_step import check_reading
 
 DOUBTFUL_SIGMAS: Final = 3.0
 """A landmark is told from its neighbour where so many standard deviations reach at most half way to it."""
@@ -94,12 +96,12 @@ class Associator:
         self._apart: dict[int, float] = {}
 
     def decide(self, step: int, motion: tuple[Floats, Floats] | None, z: Floats, Z: Floats, known: int) -> Decision:
-        """Raises ReadingRefused where a sighting is none, NumericalError where the local map cannot be.
+        """Raises ReadingRefused where a number or a covariance is none, NumericalError where the local map cannot be.
 
         Args:
             motion: odometry and its covariance. z (s, 2), Z (s, 2, 2). known: landmarks that have a number.
         """
-        _check(z, Z)
+        _check(self.model, motion, z, Z)
         local = self.local if motion is None else moved(self.model, self.local, *motion)
         near = in_reach(local.mean, local.P, _reach(self.model, z, Z), REACH_SIGMAS)
         near = near[[not self._is_doubtful(local, i, step) for i in near.tolist()]]
@@ -202,9 +204,9 @@ class Associator:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on where `state` was taken, to the bit."""
-        mean = np.frombuffer(state["mean"])
-        P = np.frombuffer(state["P"]).reshape(len(mean), len(mean))
-        self.local = LocalMap(mean, P, np.frombuffer(state["keys"], np.int64))
+        mean = np.frombuffer(state["mean"]).copy()  # for arrays that are read only kernels would be compiled anew
+        P = np.frombuffer(state["P"]).reshape(len(mean), len(mean)).copy()
+        self.local = LocalMap(mean, P, np.frombuffer(state["keys"], np.int64).copy())
         self.travel_max_m, self.reach_m, self._next = state["travel"], state["reach"], state["next"]
         self._began = state["began"]
         self._last, self._apart = dict(state["last"]), dict(state["apart"])
@@ -231,11 +233,9 @@ def _reach(model: int, z: Floats, Z: Floats) -> float:
     return float(np.max(_distances(model, z) + REACH_SIGMAS * np.sqrt(Z[:, 0, 0] + (Z[:, 1, 1] if model else 0.0))))
 
 
-def _check(z: Floats, Z: Floats) -> None:
-    det = Z[:, 0, 0] * Z[:, 1, 1] - Z[:, 0, 1] * Z[:, 1, 0]
-    if np.all(np.isfinite(z)) and np.all(Z[:, 0, 0] > 0.0) and np.all(det > 0.0) and np.all(np.isfinite(det)):
-        return
-    raise ReadingRefused(
-        "reading refused: a sighting is not finite, or its covariance not positive definite: it cannot be told what it"
-        " is of; leave it out"
-    )
+def _check(model: int, motion: tuple[Floats, Floats] | None, z: Floats, Z: Floats) -> None:
+    """What the filter refuses is refused here already, and for sightings that it is not told, too."""
+    u, cov = motion or (np.zeros(3), np.eye(3))
+    code = check_reading(model, u, cov, z, Z)
+    if code in FAULTS:
+        raise ReadingRefused(f"reading refused: {FAULTS[code]}; u={u.tolist()} z={z.tolist()}")

@@ -81,8 +81,9 @@ class Names:
             if number is None:
                 if signature < 0:
                     raise ReadingRefused(
-                        f"reading refused: a sighting has signature {signature}; landmarks without signature (data"
-                        " association) are not supported yet, give each sighting a signature of at least 0"
+                        f"reading refused: a sighting has signature {signature}, which names no landmark: give each a"
+                        " signature of at least 0, or have the vehicle find out by itself: filter.identities ="
+                        ' "associated"'
                     )
                 number = new.setdefault(signature, len(known) + len(new))
             numbers.append(number)

@@ -15,7 +15,7 @@ from fleet_seif.seif import Taken
 NONE: Final = -1
 """Signature of a sighting of which it is not known what it is of."""
 AGAIN_GATE: Final = 11.0
-"""Squared residual up to which a sighting is of a landmark when the frame is known (chi-square, 2 degrees of freedom)."""
+"""Squared residual up to which a sighting is of a landmark when the frame is known (chi-square of two: 99.6 %)."""
 AGAIN_MARGIN: Final = 6.0
 """By how much the next best landmark has to fit worse."""
 
@@ -43,6 +43,11 @@ def _best(d2: Floats) -> Ints:
         others = np.flatnonzero((found == found[i]) & (np.arange(len(d2)) != i))
         clear[i] = not len(others) or bool(best[others].min() >= best[i] + AGAIN_MARGIN)
     return np.where(clear, found, NONE)
+
+
+def _read(data: bytes, *shape: int) -> Floats:
+    """A copy: for arrays that are read only kernels would be compiled anew."""
+    return np.frombuffer(data).reshape(shape).copy()
 
 
 @dataclass
@@ -102,18 +107,13 @@ class FrameLog:
     def restored(state: tuple[Any, ...]) -> "FrameLog":
         motions, seen, heading_variance = state
         return FrameLog(
-            motions=[
-                (np.frombuffer(u), np.frombuffer(cov).reshape(3, 3), np.frombuffer(pose)) for u, cov, pose in motions
-            ],
+            motions=[(_read(u, 3), _read(cov, 3, 3), _read(pose, 3)) for u, cov, pose in motions],
             sightings=[
-                (
-                    step, np.frombuffer(names, np.int64).copy(), np.frombuffer(z).reshape(-1, 2),
-                    np.frombuffer(Z).reshape(-1, 2, 2),
-                )
+                (step, np.frombuffer(names, np.int64).copy(), _read(z, -1, 2), _read(Z, -1, 2, 2))
                 for step, names, z, Z in seen
             ],
             heading_variance=heading_variance,
-        )  # fmt: skip
+        )
 
     def guesses(self, model: int, signatures: Ints, landmarks: Floats) -> tuple[Ints, Floats]:
         """The landmarks that these sightings are of, (n,) and (n, 2) m: as estimated, or where the first puts it."""

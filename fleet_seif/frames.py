@@ -33,6 +33,7 @@ from fleet_seif.frame_log import NONE, FrameLog
 from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes, landmark_names
+from fleet_seif.local_map import begun_at, kept
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.own_map import OwnMap, first_names
@@ -284,7 +285,12 @@ class FramedFilter:
                 closed.log.rename(other, one)
         solved = self._solved(closed)
         self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
-        near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
+        try:
+            near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
+        except NumericalError as error:
+            log.warning("own_map_not_solved frame=%d reason=%s", closed.frame, error)
+            local = associator.local
+            near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
         associator.begin(self.steps, *near)
         limits = self.settings.association
         self.doubtful = duplicates.unclear > limits.unclear_max or self._own_map.misfit > limits.misfit_max
@@ -293,6 +299,8 @@ class FramedFilter:
         """Landmarks that are one from now on."""
         for pair in pairs:
             one, other = min(pair), max(pair)
+            if (one, other) in self._own_map.aliases:
+                continue
             self._own_map.aliases.append((one, other))
             self._new_aliases.append((one, other, True))
 
@@ -373,10 +381,10 @@ class FramedFilter:
             for each in self._closed
         ]  # fmt: skip
         return {
-            **state, "signatures": self._names.signatures, "log": self._log.state(), "closed": closed,
+            **state, "signatures": list(self._names.signatures), "log": self._log.state(), "closed": closed,
             "totals": [pack_delta(total.delta()) for total in self.totals],
-            "doubtful": self.doubtful, "aliases": self._own_map.aliases, "new_aliases": self._new_aliases,
-            "own": [pack_delta(delta) for delta in self._own_map.frames], "ends": np.array(self.ends).tobytes(),
+            "doubtful": self.doubtful, "new_aliases": list(self._new_aliases), "own": self._own_map.state(),
+            "ends": np.array(self.ends).tobytes(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -404,9 +412,8 @@ class FramedFilter:
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
         self.doubtful = state["doubtful"]
-        self._own_map.aliases = [(a, b) for a, b in state["aliases"]]
         self._new_aliases = [(a, b, added) for a, b, added in state["new_aliases"]]
-        self._own_map.frames = [read_delta(data) for data in state["own"]]
+        self._own_map.restore(state["own"])
         self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
 
     def _share_keys(self) -> None:

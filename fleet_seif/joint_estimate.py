@@ -97,6 +97,10 @@ class Estimate:
         self._weight = np.concatenate([self._weight, np.full(more, np.nan)])
         self._make_room_for_views()
 
+    def begin_at(self, variables: Ints, X: Floats) -> None:
+        """Where these variables are at first, shape (v, 3): frames that are taken in do not place them."""
+        self.X[variables], self._known[variables] = X, 1
+
     def _make_room_for_views(self) -> None:
         """Rows of frames stay where they are until the table of frames gives them other places."""
         rows, moved = len(self.frames.mean), self.registry.table.generation != self._generation

@@ -6,9 +6,10 @@
 2. `replay` is a function of the lives and classes alone, in the order given. One thread, no clock.
 3. `update` goes on from the last solution: frames that are the same objects about the same landmarks keep what is known
    of them, others are placed by them. Where that fails it replays.
-4. In large maps `update` improves only what has changed, all else held, until a share of the frames has come or been
+4. `solve_from` goes on from an estimate that is given, and is a function of its arguments alone.
+5. In large maps `update` improves only what has changed, all else held, until a share of the frames has come or been
    corrected since all were solved, or a frame does not fit what is held (MATHS.md 13 has what that costs).
-5. Where every vehicle has one frame and a given start pose the system is linear: one round, no robust weights.
+6. Where every vehicle has one frame and a given start pose the system is linear: one round, no robust weights.
 """
 
 from collections.abc import Sequence
@@ -96,6 +97,36 @@ class JointSolver:
         return self.replay(lives, classes)
 
     @one_thread
+    def solve_from(self, life: Life, classes: Classes, landmarks: Floats, poses: Floats) -> JointSolution:
+        """The map of one life, whose start pose is given, from an estimate on. Where that fails it replays.
+
+        Raises NumericalError where the system is not positive definite or does not settle.
+
+        Args:
+            landmarks (n, 2): by number, m; NaN unknown. poses (k, 3): where frames 1 .. k start.
+        """
+        registry = Registry(self._records)
+        added = registry.register([life], classes).added
+        estimate = Estimate(registry)
+        estimate.grow()
+        numbers = np.array([names[0].number for names in classes], np.int64)
+        known = np.flatnonzero(numbers < len(landmarks))
+        known = known[np.isfinite(landmarks[numbers[known], 0])]
+        at = np.pad(landmarks[numbers[known]], ((0, 0), (0, 1)))
+        starts = [registry.pose(life.vehicle, life.life, k) for k in range(1, len(poses) + 1)]
+        variables = np.concatenate([registry.class_variables[known], starts]).astype(np.int64)
+        estimate.begin_at(variables, np.vstack([at, poses]))
+        try:
+            estimate.take(added)
+            settled = self._settled(estimate)
+        except NumericalError:
+            settled = None
+        if settled is None:
+            return self.replay([life], classes)
+        self._estimate = estimate
+        return _solution(estimate, settled, [life], classes)
+
+    @one_thread
     def joint_covariance(self, solution: JointSolution, landmarks: Ints, poses: Ints) -> Floats:
         """Exact joint covariance of some rows of the last solution: poses, then landmarks, shape (n, n).
 
@@ -116,7 +147,7 @@ class JointSolver:
         return at if settled else None
 
     def _settled_near(self, estimate: Estimate, change: Change, lives: Sequence[Life]) -> Evaluation | None:
-        """Rule 4; None where all has to be solved."""
+        """Rule 5; None where all has to be solved."""
         changed, keys = sorted([*change.added, *change.altered]), estimate.registry.keys
         newest = {(life.vehicle, life.life, len(life.frames) - 1) for life in lives}
         self._changed.update(changed)

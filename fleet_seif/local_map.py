@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleet_seif.dense import inverse_2x2
+from fleet_seif.errors import NumericalError
 from fleet_seif.geometry import wrap
 from fleet_seif.jit import kernel
 from fleet_seif.models import heading_column, innovation_numbers, move, place, sight_numbers
@@ -89,7 +90,7 @@ def _seen(spread: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
 
 @kernel
 def expected(model: int, mean: Floats, P: Floats, which: Ints) -> tuple[Floats, Floats]:
-    """Sightings of these landmarks: expected h (c, 2), their joint covariance J P J' (2 c, 2 c) without sensor noise."""
+    """Sightings of these landmarks: expected h (c, 2), their joint covariance J P J' (2 c, 2 c) without noise."""
     h, J_x, J_y = _blocks(model, mean, which)
     return h, _seen(_spread(P, which, J_x, J_y), which, J_x, J_y)
 
@@ -145,6 +146,8 @@ def sighted(model: int, local: LocalMap, which: Ints, z: Floats, Z: Floats) -> t
 
     S = J P J' + Z        mean' = mean + P J' S^-1 r        P' = P - P J' S^-1 J P
 
+    Raises NumericalError where S is not positive definite.
+
     Args:
         which (m,): positions in the map. z (m, 2), Z (m, 2, 2).
     """
@@ -155,7 +158,12 @@ def sighted(model: int, local: LocalMap, which: Ints, z: Floats, Z: Floats) -> t
     S, r = _seen(spread, which, J_x, J_y), _innovations(model, z, h)
     for i in range(len(which)):
         S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += Z[i]
-    L = np.linalg.cholesky(S)
+    try:
+        L = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError as error:
+        raise NumericalError(
+            f"the covariance of sightings is not positive definite ({error}): reading refused"
+        ) from None
     half = np.linalg.solve(L, np.column_stack([spread.T, r]))
     gain, w = half[:, :-1], half[:, -1]
     P = local.P - gain.T @ gain

@@ -1,16 +1,17 @@
 """A vehicle's own map of its closed frames, and what of it lies around where the next one begins.
 
-Solved anew, warm, when a frame closes: with what is around, it is a function of the vehicle's own readings alone. It
-serves association; nothing of it is published.
+Solved anew when a frame closes, from where it was: a function of the vehicle's own readings alone, to the bit, whenever
+its state was stored and taken up again. It serves association; nothing of it is published.
 """
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
+from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.information import FrameDelta
-from fleet_seif.joint import JointSolver, Life, landmark_classes
+from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes
 from fleet_seif.local_map import LocalMap, seen_from
 from fleet_seif.records import UNKNOWN_SIGNATURE, Ints
 
@@ -27,6 +28,7 @@ class OwnMap:
         self.aliases: list[tuple[int, int]] = []
         self.misfit = 0.0
         self._solver = JointSolver()
+        self._landmarks, self._poses = np.empty((0, 2)), np.empty((0, 3))
 
     def put(self, frame: int, total: FrameDelta) -> None:
         """What a frame says, for the first time or anew."""
@@ -45,7 +47,7 @@ class OwnMap:
             vehicle="", life=0, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)), frames=tuple(self.frames),
             signatures=(UNKNOWN_SIGNATURE,) * last, aliases=tuple(sorted(self.aliases)),
         )  # fmt: skip
-        solution = self._solver.update([life], landmark_classes([life]))
+        solution = self._solve(life, last)
         self.misfit = float(solution.chi_square.sum() / max(int(solution.dof.sum()), 1))
         newest = [k for _, _, k in solution.poses].index(-1)
         pose, landmarks = solution.pose_mean[newest], solution.landmark_mean
@@ -57,6 +59,24 @@ class OwnMap:
         P = self._solver.joint_covariance(solution, chosen, np.array([newest]))
         numbers = np.array([names[0].number for names in solution.classes], np.int64)
         return seen_from(pose, landmarks[chosen], P, numbers[chosen]), travel_max_m
+
+    def _solve(self, life: Life, count: int) -> JointSolution:
+        solution = self._solver.solve_from(life, landmark_classes([life]), self._landmarks, self._poses)
+        self._landmarks, self._poses = np.full((count, 2), np.nan), solution.pose_mean
+        self._landmarks[[names[0].number for names in solution.classes]] = solution.landmark_mean
+        return solution
+
+    def state(self) -> tuple[Any, ...]:
+        """Plain values for msgpack; `restore` takes them back."""
+        frames = [pack_delta(delta) for delta in self.frames]
+        return frames, list(self.aliases), self._landmarks.tobytes(), self._poses.tobytes()
+
+    def restore(self, state: tuple[Any, ...]) -> None:
+        """Go on where `state` was taken, to the bit."""
+        frames, aliases, landmarks, poses = state
+        self.frames = [read_delta(data) for data in frames]
+        self.aliases = [(a, b) for a, b in aliases]
+        self._landmarks, self._poses = np.frombuffer(landmarks).reshape(-1, 2), np.frombuffer(poses).reshape(-1, 3)
 
 
 def first_names(aliases: Sequence[tuple[int, int]], count: int) -> Ints:

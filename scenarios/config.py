@@ -73,6 +73,15 @@ class Scenario(Settings):
             raise ValueError("of [detection] a [dataset] takes signatures only: the rest is for a simulated [world]")
         return self
 
+    @model_validator(mode="after")
+    def _somebody_knows_what_is_seen(self) -> "Scenario":
+        if self.detection.signatures == "none" and self.filter.identities == "signatures":
+            raise ValueError(
+                'detection.signatures = "none" hides what filter.identities = "signatures" needs: every reading would'
+                ' be refused; remedy: filter.identities = "associated"'
+            )
+        return self
+
 
 def shipped() -> dict[str, str]:
     """Names and descriptions of the scenarios that come with the package."""

@@ -53,7 +53,7 @@ def test_late_and_repeated_readings_are_refused_with_the_reason_and_change_nothi
         ((np.nan, 0, 0), COV, None, "finite"),
         ((0, 0, 0), np.diag([1e-4, 0.0, 1e-4]), None, "odometry_cov"),
         ((0, 0, 0), COV, sighting(np.inf), "finite"),
-        ((0, 0, 0), COV, sighting(signature=-1), "signature"),
+        ((0, 0, 0), COV, sighting(signature=-1), 'filter.identities = "associated"'),
     ],
 )
 def test_bad_readings_are_refused_by_name(
