@@ -57,45 +57,72 @@ def gains(d2: Floats, S: Floats, density: Floats) -> Floats:
 
 
 @kernel
+def _fit(d: Floats, B: Floats, k: int, density: float) -> tuple[float, float]:
+    """Squared distance and gain of a pair; infinite and minus infinite where nothing is left to be compared.
+
+    B (m, 3): xx, xy, yy of each covariance.
+    """
+    det = B[k, 0] * B[k, 2] - B[k, 1] * B[k, 1]
+    if not det > 0.0:
+        return np.inf, -np.inf
+    d2 = (B[k, 2] * d[k, 0] ** 2 - 2.0 * B[k, 1] * d[k, 0] * d[k, 1] + B[k, 0] * d[k, 1] ** 2) / det
+    return d2, -math.log(2.0 * math.pi * density * math.sqrt(det)) - d2 / 2.0
+
+
+@kernel
+def _condition_into(d: Floats, B: Floats, rows: Floats, S: Floats, p: int, count: int) -> None:
+    """All pairs given that p is true too: two more rows of the block Cholesky factor of S, in place.
+
+    rows (2 m, 2 m): those of the `count` pairs taken so far come first.
+    """
+    u, w = S[2 * p].copy(), S[2 * p + 1].copy()
+    for q in range(2 * count):
+        u -= rows[q, 2 * p] * rows[q]
+        w -= rows[q, 2 * p + 1] * rows[q]
+    first = math.sqrt(B[p, 0])
+    below = B[p, 1] / first
+    second = math.sqrt(B[p, 2] - below * below)
+    e_0 = d[p, 0] / first
+    e_1 = (d[p, 1] - below * e_0) / second
+    u /= first
+    w = (w - below * u) / second
+    rows[2 * count], rows[2 * count + 1] = u, w
+    for k in range(len(d)):
+        i = 2 * k
+        d[k, 0] -= u[i] * e_0 + w[i] * e_1
+        d[k, 1] -= u[i + 1] * e_0 + w[i + 1] * e_1
+        B[k, 0] -= u[i] * u[i] + w[i] * w[i]
+        B[k, 1] -= u[i] * u[i + 1] + w[i] * w[i + 1]
+        B[k, 2] -= u[i + 1] * u[i + 1] + w[i + 1] * w[i + 1]
+
+
+@kernel
+def _may_join(label: Ints, lives: Bools, a: int, b: int) -> bool:
+    """Whether two landmarks are in groups that have no life in common."""
+    a, b = label[a], label[b]
+    if a == b:
+        return False
+    for v in range(lives.shape[1]):
+        if lives[a, v] and lives[b, v]:
+            return False
+    return True
+
+
+@kernel
 def _grown_into(
     members: Ints, D: Floats, S: Floats, ends: Ints, has: Bools, density: Floats, seed: int, gate: float
 ) -> tuple[int, float]:
+    """See `grown`. Returns how many members there are, and the sum of their gains."""
     m = len(D)
-    label, lives = np.arange(len(has)), has.copy()
-    d, B = D.copy(), np.empty((m, 3))
+    label, lives, taken = np.arange(len(has)), has.copy(), np.zeros(m, np.bool_)
+    d, B, rows = D.copy(), np.empty((m, 3)), np.empty((2 * m, 2 * m))
     for k in range(m):
         B[k, 0], B[k, 1], B[k, 2] = S[2 * k, 2 * k], S[2 * k, 2 * k + 1], S[2 * k + 1, 2 * k + 1]
-    rows = np.empty((2 * m, 2 * m))
-    open_ = np.ones(m, np.bool_)
     count, total, p = 0, 0.0, seed
     while p >= 0:
-        det = B[p, 0] * B[p, 2] - B[p, 1] * B[p, 1]
-        d2 = (B[p, 2] * d[p, 0] ** 2 - 2.0 * B[p, 1] * d[p, 0] * d[p, 1] + B[p, 0] * d[p, 1] ** 2) / det
-        total += -math.log(2.0 * math.pi * density[p] * math.sqrt(det)) - d2 / 2.0
-        members[count] = p
-        open_[p] = False
-        u, w = S[2 * p].copy(), S[2 * p + 1].copy()
-        for q in range(2 * count):
-            a, b = rows[q, 2 * p], rows[q, 2 * p + 1]
-            for i in range(2 * m):
-                u[i] -= a * rows[q, i]
-                w[i] -= b * rows[q, i]
-        first = math.sqrt(B[p, 0])
-        below = B[p, 1] / first
-        second = math.sqrt(det / B[p, 0])
-        e_0 = d[p, 0] / first
-        e_1 = (d[p, 1] - below * e_0) / second
-        for i in range(2 * m):
-            u[i] /= first
-            w[i] = (w[i] - below * u[i]) / second
-            rows[2 * count, i], rows[2 * count + 1, i] = u[i], w[i]
-        for k in range(m):
-            i = 2 * k
-            d[k, 0] -= u[i] * e_0 + w[i] * e_1
-            d[k, 1] -= u[i + 1] * e_0 + w[i + 1] * e_1
-            B[k, 0] -= u[i] * u[i] + w[i] * w[i]
-            B[k, 1] -= u[i] * u[i + 1] + w[i] * w[i + 1]
-            B[k, 2] -= u[i + 1] * u[i + 1] + w[i + 1] * w[i + 1]
+        total += _fit(d, B, p, density[p])[1]
+        members[count], taken[p] = p, True
+        _condition_into(d, B, rows, S, p, count)
         count += 1
         kept, gone = label[ends[p, 0]], label[ends[p, 1]]
         for n in range(len(label)):
@@ -105,19 +132,10 @@ def _grown_into(
             lives[kept, v] = lives[kept, v] or lives[gone, v]
         p, best = -1, 0.0
         for k in range(m):
-            a, b = label[ends[k, 0]], label[ends[k, 1]]
-            if not open_[k] or a == b:
-                continue
-            for v in range(has.shape[1]):
-                if lives[a, v] and lives[b, v]:
-                    open_[k] = False
-            det = B[k, 0] * B[k, 2] - B[k, 1] * B[k, 1]
-            if not open_[k] or not det > 0.0:
-                continue
-            d2 = (B[k, 2] * d[k, 0] ** 2 - 2.0 * B[k, 1] * d[k, 0] * d[k, 1] + B[k, 0] * d[k, 1] ** 2) / det
-            gain = -math.log(2.0 * math.pi * density[k] * math.sqrt(det)) - d2 / 2.0
-            if d2 <= gate and gain > best:
-                p, best = k, gain
+            if not taken[k] and _may_join(label, lives, ends[k, 0], ends[k, 1]):
+                d2, gain = _fit(d, B, k, density[k])
+                if d2 <= gate and gain > best:
+                    p, best = k, gain
     return count, total
 
 

@@ -198,7 +198,7 @@ def _solution(estimate: Estimate, at: Evaluation, lives: Sequence[Life], classes
     return JointSolution(
         mean=np.concatenate([estimate.X[variables[:count], :2].ravel(), estimate.X[variables[count:]].ravel()]),
         classes=classes,
-        signatures=tuple(signature(names[0]) for names in classes),
+        signatures=tuple(max(signature(name) for name in names) for names in classes),
         poses=tuple(poses),
         frames=keys,
         weight=at.weight[chosen],

@@ -31,7 +31,7 @@ from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints
 
 __all__ = ["Considered", "MergeRules", "Merges", "Reason", "merged"]
 
-ROUNDS_MAX: Final = 12
+SEARCHES_MAX: Final = 12
 DEFAULT: Final = MergeRules()
 
 
@@ -50,13 +50,13 @@ def merged(
         return Merges(parts)
     try:
         return search.run()
-    except NumericalError:
+    except (NumericalError, np.linalg.LinAlgError):
         good = [life for life in lives if _is_solvable(life)]
         if len(good) in (0, len(lives)):
             return Merges(parts)
     try:
-        found = merged(good, forced, forbidden, rules)
-    except NumericalError:
+        found = _Search(good, landmark_classes(good, forced, forbidden), forbidden, rules).run()
+    except (NumericalError, np.linalg.LinAlgError):
         return Merges(parts)
     return Merges(landmark_classes(lives, forced, forbidden, found.pairs), found.pairs, found.considered)
 
@@ -117,25 +117,22 @@ class _Search:
 
     def run(self) -> Merges:
         """Raises NumericalError where the map has no solution even without merges."""
-        solver, last = JointSolver(), self.groups
+        solver, last, searches = JointSolver(), self.groups, 0
         solution = solver.replay(self.lives, self._classes())
-        for rounds in range(2 * ROUNDS_MAX):
-            if rounds:
-                try:
-                    solution = solver.update(self.lives, self._classes())
-                except NumericalError:
-                    self._undo(last)
-                    solution = solver.replay(self.lives, self._classes())
+        while True:  # ends: at most SEARCHES_MAX searches join, and what is taken out stays out
             now = self._map(solution)
             tested = left_out(solution, self.parts, now.covariance)
-            if self._take_out(now, tested):
-                continue
-            near = self._near(now)
-            reasons, found = self._proposed(now, near)
-            last = self.groups
-            if rounds >= ROUNDS_MAX or not self._join(now, near, found):
-                break
-        return self._result(now, tested, near, reasons)
+            if not self._take_out(now, tested):
+                near = self._near(now)
+                reasons, found = self._proposed(now, near)
+                last, searches = self.groups, searches + 1
+                if searches > SEARCHES_MAX or not self._join(now, near, found):
+                    return self._result(now, tested, near, reasons)
+            try:
+                solution = solver.update(self.lives, self._classes())
+            except NumericalError:
+                self._undo(last)
+                solution = solver.replay(self.lives, self._classes())
 
     def _undo(self, last: list[tuple[int, ...]]) -> None:
         """Take back what was joined last, and do not try it again."""

@@ -11,6 +11,8 @@ from fleet_seif.records import Floats, Ints
 
 NEIGHBOURS: Final = 8
 """Landmarks of one life that a density is measured over."""
+NEAR_MAX: Final = 100
+"""Landmarks around one that are looked at, whoever saw them: a bound on work where uncertainty is large."""
 CROWD_MAX: Final = 16
 """Candidates of one landmark that are looked at, the nearest first."""
 
@@ -42,10 +44,15 @@ def density(mean: Floats, has: Bools) -> Floats:
 
 
 def within(mean: Floats, reach: Floats) -> Ints:
-    """Pairs (m, 2), a < b, ascending, that may be nearer than reach_a + reach_b."""
-    near = scipy.spatial.KDTree(mean).query_ball_point(mean, 2.0 * reach)
-    a = np.repeat(np.arange(len(mean)), [len(each) for each in near])
-    b = np.concatenate([np.array(each, np.int64) for each in near])
+    """Pairs (m, 2), a < b, ascending, nearer than reach_a + reach_b; of a crowd around one the NEAR_MAX nearest."""
+    tree, many = scipy.spatial.KDTree(mean), np.empty(0, np.int64)
+    if len(mean) > NEAR_MAX:
+        many = np.flatnonzero(tree.query_ball_point(mean, 2.0 * reach, return_length=True) > NEAR_MAX)
+    few = np.setdiff1d(np.arange(len(mean)), many)
+    near = tree.query_ball_point(mean[few], 2.0 * reach[few])
+    nearest = np.asarray(tree.query(mean[many], NEAR_MAX)[1]) if len(many) else np.empty((0, NEAR_MAX), np.int64)
+    a = np.concatenate([np.repeat(few, np.array([len(each) for each in near], np.int64)), np.repeat(many, NEAR_MAX)])
+    b = np.concatenate([*(np.array(each, np.int64) for each in near), nearest.ravel()])
     ends = np.sort(np.stack([a, b], axis=1)[a != b], axis=1)
     ends = np.unique(ends, axis=0).reshape(-1, 2)
     apart = np.linalg.norm(mean[ends[:, 0]] - mean[ends[:, 1]], axis=1)

@@ -363,6 +363,13 @@ def info(file: FileArgument) -> None:
 
 @ledger.command()
 @_clear_errors()
+def merges(file: FileArgument) -> None:
+    """Say which landmarks of different vehicles were compared by place, and why some were kept apart."""
+    tools.ledger_merges(file, console)
+
+
+@ledger.command()
+@_clear_errors()
 def verify(file: FileArgument, key_ring: KeyRingOption = None) -> None:
     """Check a store: the file, every message in it (with --key-ring its signature), and the verdicts."""
     tools.ledger_verify(file, key_ring, console)

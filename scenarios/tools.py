@@ -17,7 +17,7 @@ from fleet_seif.wire import decode_snapshot
 from fusion import records
 from fusion.core import FusionCore
 from fusion.ledger import Ledger
-from fusion.merges import run_digest
+from fusion.merges import merges_of, run_digest
 from fusion.service import restore
 from scenarios import output, watch
 from scenarios.access import Kind, Member
@@ -109,6 +109,16 @@ def decision_words(ledger: Ledger) -> list[str]:
     pairs += [("forbidden", pair) for pair in ledger.decisions.forbidden]
     words = [f"{what} {' '.join('/'.join(map(str, name)) for name in pair)}" for what, pair in pairs]
     return words + [f"retracted {vehicle}" for vehicle in sorted(ledger.decisions.retracted)]
+
+
+def ledger_merges(file: Path, console: Console) -> None:
+    """Print which pairs of landmarks were compared by place, and what became of each."""
+    ledger = output.read_ledger(file, whose(file)[0])
+    table = Table("landmark", "and", "squared distance", "outcome", box=None)
+    for each in merges_of(ledger).considered:
+        names = ("/".join(map(str, name)) for name in (each.a, each.b))
+        table.add_row(*names, f"{each.d2:.2f}", str(each.reason))
+    console.print(table)
 
 
 def ledger_verify(file: Path, key_ring: Path | None, console: Console) -> None:

@@ -102,6 +102,9 @@ def picture(joint: JointMap) -> RenderableType:
         f"fleet {joint.fleet}  map {joint.version}{' final' if joint.final else ''}  "
         f"{len(joint.names)} landmarks ({shared} shared){deviation}"
     )
+    counted = joint.counters
+    if counted.get("merge_candidates"):
+        head += f"  {counted['merge_candidates']} pairs compared, {counted.get('merges_refused', 0)} kept apart"
     return Group(Text(head), grid(joint), vehicle_table(joint.vehicles), *map(Text, faults(joint.vehicles)))
 
 

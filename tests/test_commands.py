@@ -32,7 +32,7 @@ from vehicles import Vehicle
 from vehicles import records as outbox_records
 
 SETTINGS = ("fleet.vehicles=2", "world.steps=150", "world.landmarks=30")
-SUBCOMMANDS = ("info", "verify", "compact")
+SUBCOMMANDS = ("info", "merges", "verify", "compact")
 Damage = Callable[[Path], object]
 
 
