@@ -95,6 +95,10 @@ class FrameLog:
             names[:] = new
         return changed
 
+    def count(self, signature: int) -> int:
+        """How many sightings are of it."""
+        return sum(int(np.count_nonzero(names == signature)) for _, names, _, _ in self.sightings)
+
     def state(self) -> tuple[Any, ...]:
         """Plain values for msgpack; `restored` takes them back."""
         seen = [

@@ -243,8 +243,9 @@ class FramedFilter:
         z, Z = np.array(seen.z, float), np.array(seen.cov, float)
         self._associator.take(self.steps, decision, z)
         for key, number in decision.accepted.items():
-            for log_ in (self._log, *(closed.log for closed in self._closed)):
-                log_.rename(key, number)
+            self._log.rename(key, number)
+            for closed in self._closed:  # a frame with one sighting of it has nothing to test that by
+                closed.log.rename(key, number if closed.log.count(key) > 1 else NONE)
         new = (UNKNOWN_SIGNATURE,) * len(result.new)
         result = dataclasses.replace(
             result, new=new, innovation=decision.innovation, sightings=decision.dof // 2,
