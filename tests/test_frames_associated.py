@@ -173,6 +173,22 @@ def test_what_sightings_are_taken_for_is_right_with_few_exceptions() -> None:
     assert np.mean(told_of) > 0.95
 
 
+def test_the_local_map_is_bounded_and_a_frame_closes_before_the_vehicle_leaves_it() -> None:
+    few = SETTINGS.association.model_copy(update={"local_landmarks_max": 10})
+    framed, log = FramedFilter(SETTINGS.model_copy(update={"association": few})), flight()
+    framed.start(log.start)
+    numbers, frame = 0, 0
+    for each in log.readings:
+        result, _ = framed.step(each)
+        associator = framed._associator
+        assert associator is not None
+        numbers = numbers + len(result.new) if framed.frame == frame else 0
+        frame = framed.frame
+        assert np.count_nonzero(associator.local.keys >= 0) <= 10 + numbers or frame == 0
+        assert np.hypot(*framed.filter.pose[:2]) < associator.travel_max_m
+    assert len(framed.ends) > len(run(log)[0].ends)
+
+
 BAD = {
     "range not finite": {"z": np.array([[np.nan, 0.1]])},
     "range not positive": {"z": np.array([[-0.1, 0.1]])},

@@ -91,6 +91,26 @@ def test_a_warm_solution_is_the_cold_one_whatever_came_went_or_changed_before(
                 warm.update(lives, classes)
 
 
+@given(st.integers(1, FRAMES), st.integers(0, FRAMES), st.floats(0.0, 0.05), st.booleans())
+@settings(settled, max_examples=20)
+def test_from_any_estimate_near_it_the_map_is_the_cold_one_and_a_function_of_what_is_given(
+    count: int, known: int, off: float, other_before: bool
+) -> None:
+    """known: frames whose estimate is given, the landmarks of later ones are not."""
+    life, solver = drives()[0].life(count), JointSolver()
+    classes = landmark_classes([life])
+    cold = solve([life], classes)
+    landmarks, poses = np.full((len(life.signatures), 2), np.nan), cold.pose_mean[:known] + off
+    for names, mean in zip(cold.classes, cold.landmark_mean, strict=True):
+        if any(names[0].number + 1 in frame.variables for frame in life.frames[:known]):
+            landmarks[names[0].number] = mean - off
+    if other_before:
+        solver.update([drives()[1].life()], landmark_classes([drives()[1].life()]))
+    found = solver.solve_from(life, classes, landmarks, poses)
+    assert sigmas(found, cold) <= 1e-2
+    assert np.array_equal(JointSolver().solve_from(life, classes, landmarks, poses).mean, found.mean)
+
+
 def near_solver(monkeypatch: pytest.MonkeyPatch, share: float) -> JointSolver:
     """A solver for which the map of these drives is large."""
     monkeypatch.setattr(joint_solver, "NEAR_FRAMES_LEAST", 0)
