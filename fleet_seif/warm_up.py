@@ -15,7 +15,6 @@ from fleet_seif.frames import FramedFilter
 from fleet_seif.information import FrameTotal, largest_growth, to_information
 from fleet_seif.joint import Life, landmark_classes, marginal_covariances, solve
 from fleet_seif.joint_tree import LEAF_PIECES_MAX
-from fleet_seif.landmark_index import LandmarkIndex
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello
 from fleet_seif.records import Reading, Sightings
 from fleet_seif.seif import Seif
@@ -71,11 +70,5 @@ def warm_up(
     )
     decode_message(encode_message(message))
     associate(seen.z, seen.cov, seen.z, 1e-4 * np.eye(6), AssociationSettings())
-    index = LandmarkIndex(1.0)
-    for number in (0, 64):
-        index.insert(number, 0.0, 0.0)
-    index.move(0, 2.0, 0.0)
-    index.within(0.0, 0.0, 1.0)
-    index.remove(0)
     notice.cancel()
     return time.perf_counter() - begin
