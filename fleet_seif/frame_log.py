@@ -8,6 +8,7 @@ import numpy as np
 
 from fleet_seif.frame_batch import FrameReadings, FrameSolution, solve_frame
 from fleet_seif.jit import kernel
+from fleet_seif.local_map import LocalMap, squared_distances_from
 from fleet_seif.models import innovation_numbers, place, sight_numbers
 from fleet_seif.records import Floats, Ints, Sightings
 from fleet_seif.seif import Taken
@@ -93,6 +94,28 @@ class FrameLog:
             new = np.where(found >= 0, signatures[found], np.minimum(names, NONE))
             changed |= not np.array_equal(new, names)
             names[:] = new
+        return changed
+
+    def recovered(self, model: int, poses: Floats, local: LocalMap) -> bool:
+        """Give sightings that are nobody's to landmarks that have been mapped since. Returns whether there are any.
+
+        One is given to the landmark of least r' (Z + J_y P_yy J_y')^-1 r, by the same rules as in `decided_again`, if
+        no other sighting from that pose is of it.
+
+        Args:
+            poses (T, 3): as the batch has found them. local: what lies around the frame's start.
+        """
+        whole, changed = np.concatenate([np.zeros((1, 3)), poses]), False
+        for step, names, z, Z in self.sightings:
+            open_ = np.flatnonzero(names == NONE)
+            free = np.flatnonzero((local.keys >= 0) & ~np.isin(local.keys, names))
+            if not len(open_) or not len(free):
+                continue
+            d2 = squared_distances_from(model, whole[step], local.mean, local.P, free, z[open_], Z[open_])
+            found = _best(d2)
+            told = np.flatnonzero(found >= 0)
+            names[open_[told]] = local.keys[free[found[told]]]
+            changed |= len(told) > 0
         return changed
 
     def count(self, signature: int) -> int:

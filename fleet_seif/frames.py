@@ -18,7 +18,7 @@
 import dataclasses
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,8 @@ from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightin
 from fleet_seif.seif import Seif, Taken
 
 log = logging.getLogger(__name__)
+AGAIN_FRAMES = 4
+"""A frame is looked at again when so many more have closed."""
 FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
 
@@ -58,6 +60,7 @@ class Closed:
     """A frame that has ended and is to be corrected at step `due`.
 
     landmarks (n, 2): as estimated last; signatures, numbers (n,): theirs, and how they are called in the life.
+    poses (T, 3): as its batch has found them; none before.
     """
 
     frame: int
@@ -66,6 +69,20 @@ class Closed:
     landmarks: Floats
     signatures: Ints
     numbers: Ints
+    poses: Floats = field(default_factory=lambda: np.empty((0, 3)))
+
+    def state(self) -> tuple[Any, ...]:
+        """Plain values for msgpack; `restored` takes them back."""
+        arrays = (self.landmarks, self.signatures, self.numbers, self.poses)
+        return (self.frame, self.due, self.log.state(), *(array.tobytes() for array in arrays))
+
+    @staticmethod
+    def restored(state: tuple[Any, ...]) -> "Closed":
+        frame, due, log_, landmarks, signatures, numbers, poses = state
+        return Closed(
+            frame, due, FrameLog.restored(log_), np.frombuffer(landmarks).reshape(-1, 2),
+            np.frombuffer(signatures, np.int64), np.frombuffer(numbers, np.int64), np.frombuffer(poses).reshape(-1, 3),
+        )  # fmt: skip
 
 
 class FramedFilter:
@@ -88,6 +105,8 @@ class FramedFilter:
             most = min(settings.landmarks_max, FRAME_LANDMARKS_MAX)
             self._frame_settings = settings.model_copy(update={"landmarks_max": most})
         self._closed: list[Closed] = []
+        self._looked_at: list[Closed] = []
+        self._late: list[FramePart] = []
         self._associator = Associator(settings.association, model) if settings.identities == "associated" else None
         self._own_map = OwnMap()
         self.doubtful = False
@@ -234,8 +253,9 @@ class FramedFilter:
                 FramePart(frame=frame, status=FrameStatus.ENDED, delta=nothing, end_pose=self._close()),
             ]
         while self._closed and self._closed[0].due <= self.steps:
-            parts += self._correction(self._closed.pop(0))
-        return result, tuple(parts)
+            parts += self._corrected(self._closed.pop(0))
+        late, self._late = self._late, []
+        return result, (*parts, *late)
 
     def _take_decision(self, decision: Decision, result: StepResult, seen: Sightings) -> tuple[StepResult, Taken]:
         """What sightings were taken for holds from now on: the step as published, and as it is kept."""
@@ -244,7 +264,7 @@ class FramedFilter:
         self._associator.take(self.steps, decision, z)
         for key, number in decision.accepted.items():
             self._log.rename(key, number)
-            for closed in self._closed:  # a frame with one sighting of it has nothing to test that by
+            for closed in (*self._looked_at, *self._closed):  # with one sighting of it, it has nothing to test that by
                 closed.log.rename(key, number if closed.log.count(key) > 1 else NONE)
         new = (UNKNOWN_SIGNATURE,) * len(result.new)
         result = dataclasses.replace(
@@ -293,6 +313,8 @@ class FramedFilter:
             local = associator.local
             near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
         associator.begin(self.steps, *near)
+        while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
+            self._late += self._looked_at_again(self._looked_at.pop(0))
         limits = self.settings.association
         self.doubtful = duplicates.unclear > limits.unclear_max or self._own_map.misfit > limits.misfit_max
 
@@ -324,6 +346,7 @@ class FramedFilter:
                 known = signatures[batch.seen], batch.mean[3:].reshape(-1, 2)[batch.seen]
                 if closed.log.decided_again(self.model, batch.poses, *known):
                     batch = closed.log.solved(self.model, signatures, landmarks, self.settings.frame_huber)
+            closed.poses = batch.poses
             order = np.argsort(numbers)
             order = order[batch.seen[order]]
             rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
@@ -332,6 +355,21 @@ class FramedFilter:
             return quantised(variables, H, b, mean), batch.mean[:3]
         except NumericalError:
             return None
+
+    def _corrected(self, closed: Closed) -> list[FramePart]:
+        """The correction of a frame, which is looked at again later where sightings are associated."""
+        if self._associator is not None:
+            self._looked_at.append(closed)
+        return self._correction(closed)
+
+    def _looked_at_again(self, closed: Closed) -> list[FramePart]:
+        """Correct a frame once more, if what has been mapped since tells what some of its sightings are of."""
+        try:
+            local = self._own_map.around_start(closed.frame, self.settings.association.local_landmarks_max)
+        except NumericalError:
+            return []
+        found = closed.log.recovered(self.model, closed.poses, local) if len(closed.poses) else False
+        return self._correction(closed) if found else []
 
     def _correction(self, closed: Closed) -> list[FramePart]:
         """What the batch over a closed frame changes, to be published; nothing where it fails, or nothing moved."""
@@ -360,8 +398,11 @@ class FramedFilter:
             end_pose = self.filter.pose if self._single else self._close()
             parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=nothing, end_pose=end_pose))
         for closed in self._closed:
-            parts += self._correction(closed)
-        self._closed.clear()
+            parts += self._corrected(closed)
+        for closed in self._looked_at:
+            parts += self._looked_at_again(closed)
+        parts += self._late
+        self._closed, self._looked_at, self._late = [], [], []
         self._localised = self.steps - self.settings.localise_steps
         return tuple(parts)
 
@@ -374,15 +415,10 @@ class FramedFilter:
         }  # fmt: skip
         if self._single:
             return state
-        closed = [
-            (
-                each.frame, each.due, each.log.state(), each.landmarks.tobytes(), each.signatures.tobytes(),
-                each.numbers.tobytes(),
-            )
-            for each in self._closed
-        ]  # fmt: skip
         return {
-            **state, "signatures": list(self._names.signatures), "log": self._log.state(), "closed": closed,
+            **state, "signatures": list(self._names.signatures), "log": self._log.state(),
+            "closed": [each.state() for each in self._closed],
+            "looked_at": [each.state() for each in self._looked_at],
             "totals": [pack_delta(total.delta()) for total in self.totals],
             "doubtful": self.doubtful, "new_aliases": list(self._new_aliases), "own": self._own_map.state(),
             "ends": np.array(self.ends).tobytes(),
@@ -401,13 +437,8 @@ class FramedFilter:
             return
         self._localised = self.steps - self.settings.localise_steps
         self._log = FrameLog.restored(state["log"])
-        self._closed = [
-            Closed(
-                frame, due, FrameLog.restored(log), np.frombuffer(landmarks).reshape(-1, 2),
-                np.frombuffer(signatures, np.int64), np.frombuffer(numbers, np.int64),
-            )
-            for frame, due, log, landmarks, signatures, numbers in state["closed"]
-        ]  # fmt: skip
+        self._closed = [Closed.restored(each) for each in state["closed"]]
+        self._looked_at = [Closed.restored(each) for each in state["looked_at"]]
         self._share_keys()
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
@@ -421,7 +452,8 @@ class FramedFilter:
         """What sightings are taken for is kept once: by the logs of frames and by `assigned`."""
         if self._associator is None:
             return
-        (keys,), logs = self._assigned, [*(closed.log for closed in self._closed), self._log]
+        (keys,), logs = self._assigned, [closed.log for closed in (*self._looked_at, *self._closed)]
+        logs.append(self._log)
         at = len(keys) - sum(len(names) for each in logs for _, names, _, _ in each.sightings)
         for each in logs:
             for i, (step, names, z, Z) in enumerate(each.sightings):

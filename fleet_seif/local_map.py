@@ -122,6 +122,24 @@ def from_pose_std(P: Floats, i: int) -> float:
     return float(np.sqrt(max((xx + yy) / 2 + np.sqrt((xx - yy) ** 2 / 4 + xy * xy), 0.0)))
 
 
+@kernel
+def squared_distances_from(model: int, x: Floats, mean: Floats, P: Floats, which: Ints, z: Floats, Z: Floats) -> Floats:
+    """r' (Z + J_y P_yy J_y')^-1 r of sightings from a certain pose x (3,) with these landmarks, shape (s, c)."""
+    out = np.empty((len(z), len(which)))
+    for j in range(len(which)):
+        a = 3 + 2 * which[j]
+        h0, h1, _, _, y00, y01, _, _, y10, y11 = sight_numbers(model, x, mean[a], mean[a + 1])
+        p, q, w = P[a, a], P[a, a + 1], P[a + 1, a + 1]
+        c00 = y00 * y00 * p + 2.0 * y00 * y01 * q + y01 * y01 * w
+        c01 = y00 * y10 * p + (y00 * y11 + y01 * y10) * q + y01 * y11 * w
+        c11 = y10 * y10 * p + 2.0 * y10 * y11 * q + y11 * y11 * w
+        for i in range(len(z)):
+            r0, r1 = innovation_numbers(model, z[i, 0], z[i, 1], h0, h1)
+            s00, s01, s11 = Z[i, 0, 0] + c00, Z[i, 0, 1] + c01, Z[i, 1, 1] + c11
+            out[i, j] = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / (s00 * s11 - s01 * s01)
+    return out
+
+
 def moved(model: int, local: LocalMap, u: Floats, cov: Floats) -> LocalMap:
     """After odometry u (3,) with covariance cov (3, 3)."""
     pose, J_x, J_u = move(model, local.pose, u)

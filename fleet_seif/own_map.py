@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from fleet_seif.delta_wire import pack_delta, read_delta
+from fleet_seif.errors import NumericalError
 from fleet_seif.information import FrameDelta
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes
 from fleet_seif.local_map import LocalMap, seen_from
@@ -28,6 +29,7 @@ class OwnMap:
         self.aliases: list[tuple[int, int]] = []
         self.misfit = 0.0
         self._solver = JointSolver()
+        self._solution: JointSolution | None = None
         self._landmarks, self._poses = np.empty((0, 2)), np.empty((0, 3))
 
     def put(self, frame: int, total: FrameDelta) -> None:
@@ -47,7 +49,8 @@ class OwnMap:
             vehicle="", life=0, start_pose=np.zeros(3), start_pose_cov=np.zeros((3, 3)), frames=tuple(self.frames),
             signatures=(UNKNOWN_SIGNATURE,) * last, aliases=tuple(sorted(self.aliases)),
         )  # fmt: skip
-        solution = self._solve(life, last)
+        self._solution = None
+        self._solution = solution = self._solve(life, last)
         self.misfit = float(solution.chi_square.sum() / max(int(solution.dof.sum()), 1))
         newest = [k for _, _, k in solution.poses].index(-1)
         pose, landmarks = solution.pose_mean[newest], solution.landmark_mean
@@ -59,6 +62,26 @@ class OwnMap:
         P = self._solver.joint_covariance(solution, chosen, np.array([newest]))
         numbers = np.array([names[0].number for names in solution.classes], np.int64)
         return seen_from(pose, landmarks[chosen], P, numbers[chosen]), travel_max_m
+
+    def around_start(self, frame: int, most: int) -> LocalMap:
+        """The landmarks around the start of a frame, at most so many, by the solution of the last `around`.
+
+        Raises NumericalError where there is none.
+        """
+        solution = self._solution
+        if solution is None:
+            raise NumericalError("no own map: its frames could not be solved")
+        at = [i for i, (_, _, k) in enumerate(solution.poses) if k == frame]
+        start = solution.pose_mean[at[0]] if at else np.zeros(3)
+        away = np.hypot(*(solution.landmark_mean - start[:2]).T)
+        chosen = np.sort(np.argsort(away, kind="stable")[:most])
+        P = self._solver.joint_covariance(solution, chosen, np.array(at, np.int64))
+        if not at:  # the first frame's start is given
+            whole = np.zeros((len(P) + 3, len(P) + 3))
+            whole[3:, 3:] = P
+            P = whole
+        numbers = np.array([names[0].number for names in solution.classes], np.int64)
+        return seen_from(start, solution.landmark_mean[chosen], P, numbers[chosen])
 
     def _solve(self, life: Life, count: int) -> JointSolution:
         solution = self._solver.solve_from(life, landmark_classes([life]), self._landmarks, self._poses)
