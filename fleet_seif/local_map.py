@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleet_seif.dense import inverse_2x2
+from fleet_seif.dense import cholesky_into, inverse_2x2
 from fleet_seif.errors import NumericalError
 from fleet_seif.geometry import wrap
 from fleet_seif.jit import kernel
@@ -176,16 +176,41 @@ def sighted(model: int, local: LocalMap, which: Ints, z: Floats, Z: Floats) -> t
     S, r = _seen(spread, which, J_x, J_y), _innovations(model, z, h)
     for i in range(len(which)):
         S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += Z[i]
-    try:
-        L = np.linalg.cholesky(S)
-    except np.linalg.LinAlgError as error:
-        raise NumericalError(
-            f"the covariance of sightings is not positive definite ({error}): reading refused"
-        ) from None
-    half = np.linalg.solve(L, np.column_stack([spread.T, r]))
-    gain, w = half[:, :-1], half[:, -1]
-    P = local.P - gain.T @ gain
-    return replace(local, mean=local.mean + gain.T @ w, P=(P + P.T) / 2), float(w @ w)
+    gain, w = np.ascontiguousarray(spread.T), r.copy()
+    if not _halved_into(gain, w, S):
+        raise NumericalError("the covariance of sightings is not positive definite: reading refused")
+    P = local.P.copy()
+    _shrink(P, gain)
+    return replace(local, mean=local.mean + w @ gain, P=P), float(w @ w)
+
+
+@kernel
+def _halved_into(gain: Floats, w: Floats, S: Floats) -> bool:
+    """L^-1 J P in place of J P (m, n), L^-1 r in place of r (m,), S = L L'; False where S is not positive definite."""
+    m = len(S)
+    L = np.zeros((m, m))
+    if not cholesky_into(L, S, m):
+        return False
+    for i in range(m):
+        for k in range(i):
+            w[i] -= L[i, k] * w[k]
+            gain[i] -= L[i, k] * gain[k]
+        w[i] /= L[i, i]
+        gain[i] /= L[i, i]
+    return True
+
+
+@kernel
+def _shrink(P: Floats, gain: Floats) -> None:
+    """P - G'G in place of P (n, n), which stays symmetric. Loops: a library wakes threads for so little."""
+    for i in range(len(P)):
+        for k in range(len(gain)):
+            a = gain[k, i]
+            for j in range(i + 1):
+                P[i, j] -= a * gain[k, j]
+    for i in range(len(P)):
+        for j in range(i):
+            P[j, i] = P[i, j]
 
 
 def with_new(model: int, local: LocalMap, key: int, z: Floats, Z: Floats) -> LocalMap:
@@ -214,6 +239,25 @@ def renamed(local: LocalMap, key: int, new: int) -> LocalMap:
     return replace(local, keys=np.where(local.keys == key, new, local.keys))
 
 
+@kernel
+def _seen_from(R_T: Floats, turn: Floats, P: Floats) -> Floats:
+    """J P J' with J = [-R'  turn  R'] for each landmark, P (3 + 2 k, 3 + 2 k) pose first, turn (2 k,)."""
+    n = len(P) - 3
+    half = np.empty((n, n + 3))
+    for i in range(n):
+        a, b = R_T[i % 2, 0], R_T[i % 2, 1]
+        first = 3 + i - i % 2
+        for j in range(n + 3):
+            half[i, j] = a * (P[first, j] - P[0, j]) + b * (P[first + 1, j] - P[1, j]) + turn[i] * P[2, j]
+    out = np.empty((n, n))
+    for j in range(n):
+        a, b = R_T[j % 2, 0], R_T[j % 2, 1]
+        first = 3 + j - j % 2
+        for i in range(n):
+            out[i, j] = a * (half[i, first] - half[i, 0]) + b * (half[i, first + 1] - half[i, 1]) + turn[j] * half[i, 2]
+    return out
+
+
 def seen_from(start: Floats, landmarks: Floats, P: Floats, keys: Ints) -> LocalMap:
     """Landmarks (k, 2) in the world, as seen from the pose `start` (3,) that becomes the origin.
 
@@ -226,13 +270,9 @@ def seen_from(start: Floats, landmarks: Floats, P: Floats, keys: Ints) -> LocalM
     R_T = np.array([[c, s], [-s, c]])
     y = (landmarks - start[:2]) @ R_T.T
     k = len(y)
-    J = np.zeros((2 * k, 3 + 2 * k))
-    for i in range(k):
-        J[2 * i : 2 * i + 2, :2] = -R_T
-        J[2 * i : 2 * i + 2, 2] = y[i, 1], -y[i, 0]
-        J[2 * i : 2 * i + 2, 3 + 2 * i : 5 + 2 * i] = R_T
+    turn = np.column_stack([y[:, 1], -y[:, 0]]).ravel()
     whole = np.zeros((3 + 2 * k, 3 + 2 * k))
-    whole[3:, 3:] = J @ P @ J.T
+    whole[3:, 3:] = _seen_from(R_T, turn, P)
     return LocalMap(np.concatenate([np.zeros(3), y.ravel()]), (whole + whole.T) / 2, keys)
 
 
