@@ -3,7 +3,8 @@
 Two landmarks that were never sighted together may be one. Their difference is an error with a known covariance, and so
 are those of all such pairs, jointly. The search for sets of pairs that agree is that between vehicles
 (fleet_seif.alignments): a pattern of landmarks says more than each of them. A pair by itself counts where its place is
-so well known that it cannot be taken for a neighbour.
+so well known that it cannot be taken for a neighbour. How dense landmarks are is told by how far the second nearest is:
+where many have been begun twice the nearest is the landmark itself.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import scipy.spatial
 
 from fleet_seif.alignments import judged
 from fleet_seif.consistent import Candidates
-from fleet_seif.joint_covariance import squared_distances
+from fleet_seif.joint_covariance import halved, squared_distances
 from fleet_seif.local_map import LocalMap
 from fleet_seif.merge_records import MergeRules, Reason
 from fleet_seif.records import Floats, Ints
@@ -24,6 +25,10 @@ ALONE_GATE: Final = 9.2
 """Squared distance up to which a pair by itself is one landmark (chi-square, 2 degrees of freedom: 99 %)."""
 ALONE_SIGMAS: Final = 3.0
 """A pair by itself counts where so many standard deviations reach at most half way to the next landmark."""
+
+PAIRS_MAX: Final = 512
+"""Of pairs that may be one so many are looked at, those whose difference is known best: where a vehicle hardly knows
+where it is, all may be."""
 
 
 def nearest_m(places: Floats, k: int = 1) -> Floats:
@@ -43,16 +48,22 @@ def own_duplicates(
     d2 = squared_distances(mean[ends[:, 0]] - mean[ends[:, 1]], S)
     near = np.flatnonzero(d2 <= rules.gate)
     near = near[[not together(int(keys[a]), int(keys[b])) for a, b in ends[near].tolist()]]
-    ends, S, d2 = ends[near], S[near], d2[near]
-    if not len(ends):
+    if not len(near) or len(keys) < 3:  # with two landmarks nothing says how far the next may be
         return []
-    alone = 2.0 * ALONE_SIGMAS * np.sqrt(np.linalg.eigvalsh(S)[:, -1]) <= nearest_m(mean, 2)[ends].min(axis=1)
-    same = alone & (d2 <= ALONE_GATE)
-    D = mean[ends[:, 0]] - mean[ends[:, 1]]
-    density = np.full(len(ends), 1.0 / (np.pi * np.median(nearest_m(mean)) ** 2))
-    pairs = Candidates(D, _joint_differences(local.P, rows[ends]), ends, np.eye(len(keys), dtype=bool), density)
-    verdicts, _ = judged(pairs, mean, rules)
-    same |= np.array([verdict is Reason.MERGED for verdict in verdicts], bool)
+    std = np.sqrt(np.linalg.eigvalsh(S[near])[:, -1])
+    best = np.sort(np.argsort(std, kind="stable")[:PAIRS_MAX])
+    near, std = near[best], std[best]
+    ends, d2 = ends[near], d2[near]
+    apart = nearest_m(mean, 2)
+    same = (2.0 * ALONE_SIGMAS * std <= apart[ends].min(axis=1)) & (d2 <= ALONE_GATE)
+    density = 2.0 / (np.pi * np.median(apart) ** 2)
+    for some in halved(mean[ends].mean(axis=1), rules.group_max):
+        pairs = Candidates(
+            mean[ends[some, 0]] - mean[ends[some, 1]], _joint_differences(local.P, rows[ends[some]]), ends[some],
+            np.eye(len(keys), dtype=bool), np.full(len(some), density),
+        )  # fmt: skip
+        verdicts, _ = judged(pairs, mean, rules)
+        same[some] |= np.array([verdict is Reason.MERGED for verdict in verdicts], bool)
     return [(int(keys[a]), int(keys[b])) for a, b in ends[same].tolist()]
 
 

@@ -34,24 +34,24 @@ class Standing:
         self.step = 0
         self.numbers: list[int] = []
 
-    def decide(self, *places: Sequence[float]) -> Decision:
+    def decide(self, *places: Sequence[float] | Floats) -> Decision:
         z, Z = self.seen(*places)
         return self.associator.decide(self.step, STILL if self.step else None, z, Z, len(self.numbers))
 
-    def seen(self, *places: Sequence[float]) -> tuple[Floats, Floats]:
+    def seen(self, *places: Sequence[float] | Floats) -> tuple[Floats, Floats]:
         """Sightings of what is at these places (x, y), without noise; as wide across as along."""
         model = self.associator.model
         z = np.array([reference.expected(model, np.zeros(3), np.array(place)) for place in places]).reshape(-1, 2)
         across = np.ones(len(z)) if model == COMPASS_XY else np.hypot(*np.array(places).reshape(-1, 2).T)
         return z, np.array([np.diag([STD**2, (STD / r) ** 2]) for r in across.tolist()]).reshape(-1, 2, 2)
 
-    def look(self, *places: Sequence[float]) -> list[int]:
+    def look(self, *places: Sequence[float] | Floats) -> list[int]:
         """One step; what its sightings are taken for."""
         decision = self.decide(*places)
         self.associator.take(self.step, decision, self.seen(*places)[0])
         self.numbers += sorted(decision.accepted.values())
         self.step += 1
-        return decision.keys.tolist()
+        return [int(key) for key in decision.keys]
 
 
 def stored(associator: Associator) -> bytes:
