@@ -3,7 +3,8 @@
 Two landmarks that were never sighted together may be one. Their difference is an error with a known covariance, and so
 are those of all such pairs, jointly. The search for sets of pairs that agree is that between vehicles
 (fleet_seif.alignments): a pattern of landmarks says more than each of them. A pair by itself counts where its place is
-so well known that it cannot be taken for a neighbour.
+so well known that it cannot be taken for a neighbour. How dense landmarks are is told by how far the second nearest is:
+where many have been begun twice the nearest is the landmark itself.
 """
 
 from collections.abc import Callable
@@ -53,14 +54,15 @@ def own_duplicates(local: LocalMap, together: Callable[[int, int], bool], rules:
     near = near[[not together(int(keys[a]), int(keys[b])) for a, b in ends[near].tolist()]]
     near = near[np.argsort(d2[near], kind="stable")[:PAIRS_MAX]]
     ends, S, d2 = ends[near], S[near], d2[near]
-    if not len(ends):
+    if not len(ends) or len(keys) < 3:  # with two landmarks nothing says how far the next may be
         return Duplicates([], 0.0)
     D = mean[ends[:, 0]] - mean[ends[:, 1]]
     reach = np.linalg.norm(D, axis=1) + ALONE_SIGMAS * np.sqrt(np.linalg.eigvalsh(S)[:, -1])
-    same = 2.0 * reach <= nearest_m(mean, 2)[ends].min(axis=1)
+    apart = nearest_m(mean, 2)
+    same = 2.0 * reach <= apart[ends].min(axis=1)
     found = [(int(keys[a]), int(keys[b])) for a, b in ends[same].tolist()]
     ends, D = ends[d2 <= rules.gate], D[d2 <= rules.gate]
-    density = np.full(len(ends), 1.0 / (np.pi * np.median(nearest_m(mean)) ** 2))
+    density = np.full(len(ends), 2.0 / (np.pi * np.median(apart) ** 2))
     candidates = Candidates(D, _joint_differences(local.P, rows[ends]), ends, np.eye(len(keys), dtype=bool), density)
     verdicts, _ = judged(candidates, mean, rules)
     fits = [verdict is Reason.MERGED for verdict in verdicts]

@@ -8,10 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from fleet_seif.association import associate
 from fleet_seif.config import AssociationSettings, FilterSettings
+from fleet_seif.consistent import Candidates, grown
 from fleet_seif.definite import is_positive_definite
+from fleet_seif.frame_deltas import quantised
 from fleet_seif.frames import FramedFilter
+from fleet_seif.geometry import between
 from fleet_seif.information import FrameTotal, largest_growth, to_information
 from fleet_seif.joint import Life, landmark_classes, marginal_covariances, solve
 from fleet_seif.joint_tree import LEAF_PIECES_MAX
@@ -23,12 +25,34 @@ from fleet_seif.wire import decode_message, encode_message
 PATIENCE_S = 2.0
 
 
+SEEN = Sightings(
+    z=np.array([[1.0, 0.1], [1.0, -1.0], [2.0, 1.0]]), cov=np.tile(1e-4 * np.eye(2), (3, 1, 1)), signature=np.arange(3)
+)
+
+
+def _tell_apart() -> None:
+    """What a vehicle runs besides where nothing says what it sees."""
+    association = AssociationSettings(confirm_sightings=1)
+    framed = FramedFilter(
+        FilterSettings(frame_steps_max=1, close_lag_steps=1, identities="associated", association=association)
+    )
+    framed.start(SEEN)
+    for k, seen in enumerate((SEEN, Sightings.none(), Sightings.none(), SEEN), start=1):
+        framed.step(Reading(time_s=float(k), odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=seen))
+    pairs = Candidates(np.zeros((1, 2)), np.eye(2), np.array([[0, 1]]), np.eye(2, dtype=bool), np.ones(1))
+    grown(pairs, 0, 1.0)
+
+
 def warm_up(
-    say: Callable[[str], None] = lambda text: None, *, frames: Literal["single", "adaptive"] = "single"
+    say: Callable[[str], None] = lambda text: None,
+    *,
+    frames: Literal["single", "adaptive"] = "single",
+    identities: Literal["signatures", "associated"] = "signatures",
 ) -> float:
     """Run everything that is compiled once, on a toy. Returns the seconds it took.
 
-    frames: as in FilterSettings; "single" does without the batch that closes a frame.
+    frames, identities: as in FilterSettings; "single" does without the batch that closes a frame, "signatures" without
+    what tells landmarks apart.
     say: told where it takes longer than PATIENCE_S, which it does on the first run after an installation.
     """
     begin = time.perf_counter()
@@ -37,20 +61,17 @@ def warm_up(
     )
     notice.daemon = True
     notice.start()
-    seen = Sightings(
-        z=np.array([[1.0, 0.1], [1.0, -1.0], [2.0, 1.0]]),
-        cov=np.tile(1e-4 * np.eye(2), (3, 1, 1)),
-        signature=np.arange(3),
-    )
-    motion = Reading(time_s=1.0, odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=seen)
+    motion = Reading(time_s=1.0, odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=SEEN)
     framed = FramedFilter(FilterSettings(active_max=1, frames=frames, frame_steps_max=1, close_lag_steps=1))
-    backwards = dataclasses.replace(motion, sightings=dataclasses.replace(seen, signature=np.array([2, 1, 0])))
+    backwards = dataclasses.replace(motion, sightings=dataclasses.replace(SEEN, signature=np.array([2, 1, 0])))
     total = FrameTotal()
-    total.add(framed.start(seen)[0].delta)
+    total.add(framed.start(SEEN)[0].delta)
     for _ in range(3):
         framed.step(backwards)
     for delta in framed.published():
         total.add(delta)
+    between(framed.pose, np.zeros(3))
+    FrameTotal().add(quantised(np.arange(9), np.eye(19) + 0.01, np.zeros(19), np.zeros(19)))  # its table grows
     to_information(total.delta())
     is_positive_definite(total.delta())
     largest_growth(total.delta())
@@ -69,6 +90,7 @@ def warm_up(
         fleet="f", vehicle="v", epoch=Epoch(0, 0), first=0, last=0, step=0, time_s=0.0, parts=(part,), hello=hello
     )
     decode_message(encode_message(message))
-    associate(seen.z, seen.cov, seen.z, 1e-4 * np.eye(6), AssociationSettings())
+    if identities == "associated":
+        _tell_apart()
     notice.cancel()
     return time.perf_counter() - begin

@@ -285,7 +285,11 @@ def run_vehicle(
     acknowledgement."""
     sys.setswitchinterval(SWITCH_S)
     log = record(scenario, only=name).logs[name]
-    warm_up(lambda text: say({"event": "note", "text": text}), frames=scenario.filter.frames)
+    warm_up(
+        lambda text: say({"event": "note", "text": text}),
+        frames=scenario.filter.frames,
+        identities=scenario.filter.identities,
+    )
     number = vehicle_names(scenario).index(name)
     fleet = scenario.fleet.name
     signer = place.signer(fleet, Role.VEHICLE, name)

@@ -121,7 +121,7 @@ def run(
     if out is not None:
         output.prepare_folder(out)
     recording = record(chosen)
-    warm_up(say, frames=chosen.filter.frames)
+    warm_up(say, frames=chosen.filter.frames, identities=chosen.filter.identities)
     totals = {name: log.steps for name, log in recording.logs.items()}
     with progress_bars(console, totals, quiet) as progress:
         if virtual:
@@ -419,7 +419,7 @@ def run_chaos(
     """Run a scenario many times in one process each, with faults drawn from seeds, and demand the same map."""
     chosen = load_scenario(scenario, tuple(settings or ()))
     chaos_runs.seed_range(seeds)
-    warm_up(_say, frames=chosen.filter.frames)
+    warm_up(_say, frames=chosen.filter.frames, identities=chosen.filter.identities)
     if schedule is not None:
         tally = chaos_runs.Arena(chosen).run(chaos_runs.read_schedule(schedule))
     else:

@@ -38,6 +38,17 @@ def test_seeds_of_chaos_end_with_equal_maps(small: Arena) -> None:
     assert tally.kills > 60
 
 
+def test_seeds_of_chaos_without_identities_end_with_equal_maps() -> None:
+    """Frames of 12 steps: kills fall on their ends, and on what is decided again after them."""
+    changed = ("fleet.vehicles=2", "world.routes=coverage", "world.steps=40", "noise.turn_std_rad=0.1")
+    arena = Arena(load_scenario("three_air_vehicles_unknown", (*changed, "filter.frame_steps_max=12")))
+    tally = Tally()
+    for seed in range(6):
+        tally.add(arena.run(arena.schedule(seed)))
+    assert tally.failures == []
+    assert tally.kills > 6
+
+
 def test_a_kill_before_any_effect_loses_nothing(tiny: Arena) -> None:
     tally = Tally()
     for seed in (1, 2, 3):
