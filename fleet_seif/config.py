@@ -52,7 +52,7 @@ class AssociationSettings(Settings):
     nodes_max: Annotated[int, Field(ge=1, le=10_000_000)] = 500
     confirm_sightings: Annotated[int, Field(ge=1, le=100)] = 3
     confirm_steps: Annotated[int, Field(ge=1, le=1000)] = 8
-    unclear_max: Probability = 0.15
+    unclear_max: Probability = 0.2
     misfit_max: Positive = 2.0
     local_landmarks_max: Annotated[int, Field(ge=10, le=1000)] = 150
 
