@@ -24,6 +24,7 @@ from fleet_seif.association_guards import Verdict
 from fleet_seif.config import AssociationSettings
 from fleet_seif.errors import ReadingRefused
 from fleet_seif.frame_log import NONE
+from fleet_seif.jit import one_thread
 from fleet_seif.local_map import (
     LocalMap,
     begun_at,
@@ -95,6 +96,7 @@ class Associator:
         self._together: Counter[tuple[int, int]] = Counter()
         self._apart: dict[int, float] = {}
 
+    @one_thread
     def decide(self, step: int, motion: tuple[Floats, Floats] | None, z: Floats, Z: Floats, known: int) -> Decision:
         """Raises ReadingRefused where a number or a covariance is none, NumericalError where the local map cannot be.
 
@@ -164,10 +166,12 @@ class Associator:
         """Whether this pose in the frame is so far from its start that the local map may lack what is sighted."""
         return bool(np.hypot(pose[0], pose[1]) >= self.travel_max_m)
 
+    @one_thread
     def duplicates(self) -> Duplicates:
         """Landmarks that have been begun twice (rule 3): pairs of keys."""
         return own_duplicates(self.local, lambda a, b: self._together[min(a, b), max(a, b)] >= TOGETHER_LEAST)
 
+    @one_thread
     def begin(self, step: int, near: LocalMap, travel_max_m: float) -> None:
         """A frame begins after this step: with these landmarks, as seen from there, and the provisional ones."""
         self._began = step

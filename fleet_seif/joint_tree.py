@@ -426,6 +426,8 @@ class Tree:
         """
         sizes = self.size[variables]
         ends = np.cumsum(sizes)
+        if not len(ends):
+            return np.zeros((0, 0))
         column = dict(zip(variables.tolist(), (ends - sizes).tolist(), strict=True))
         g: dict[Node, Floats] = {}
         for v in variables.tolist():

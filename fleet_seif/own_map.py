@@ -12,6 +12,7 @@ import numpy as np
 from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.errors import NumericalError
 from fleet_seif.information import FrameDelta
+from fleet_seif.jit import one_thread
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes
 from fleet_seif.local_map import LocalMap, seen_from
 from fleet_seif.records import UNKNOWN_SIGNATURE, Ints
@@ -38,6 +39,7 @@ class OwnMap:
             self.frames.append(total)
         self.frames[frame] = total
 
+    @one_thread
     def around(self, most: int, reach_m: float) -> tuple[LocalMap, float]:
         """The landmarks around the end of the last frame, as seen from there, and how far they are all there are.
 

@@ -163,8 +163,8 @@ def test_what_sightings_are_taken_for_is_right_with_few_exceptions() -> None:
     log = flown()
     framed, _ = run(flight())
     score = associate(log, framed.assigned)
-    assert (score.precision or 0.0) > 0.98
-    assert (score.recall or 0.0) > 0.85
+    assert (score.precision or 0.0) > 0.97  # turns are three times as noisy as in the mild world
+    assert (score.recall or 0.0) > 0.9
     framed, _ = run(compass(), model=COMPASS_XY)
     truth = np.concatenate([compass().start.signature, *(each.sightings.signature for each in compass().readings)])
     told_of = framed.assigned >= 0
