@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from fleet_seif.errors import RunError
 from fleet_seif.joint import JointSolution, marginal_covariances, solve
 from fleet_seif.merging import Merges
 from fleet_seif.records import Floats
@@ -56,7 +57,13 @@ class Outcome:
 
 
 def evaluate(run: FinishedRun) -> Outcome:
-    """Solve canonically and score."""
+    """Solve canonically and score. Raises RunError where no vehicle is part of the map."""
+    doubtful = sorted({s.vehicle for s in run.ledger.streams.values() if not s.healthy})
+    if not run.ledger.lives():
+        raise RunError(
+            f"no vehicle is part of the map; doubtful by their own word: {', '.join(doubtful) or 'none'}. Without"
+            " identities landmarks may be too close together for this noise: see filter.association"
+        )
     merges = merges_of(run.ledger)
     solution = solve(run.ledger.lives(), merges.classes)
     landmark_cov, _ = marginal_covariances(solution)
@@ -70,7 +77,7 @@ def evaluate(run: FinishedRun) -> Outcome:
         "digest": run.ledger.map_digest(merges.classes).hex(),
         **{name: value for name, value in vars(score).items() if name != "landmark_truth"},
         **fleet_association(run.recording, {name: drive.assigned for name, drive in run.drives.items()}).fields(),
-        "doubtful_vehicles": sorted({s.vehicle for s in run.ledger.streams.values() if not s.healthy}),
+        "doubtful_vehicles": doubtful,
         "vehicles": {name: _vehicle(run, name) for name in run.recording.logs},
         "frames": _frames(solution),
         "merging": _merging(merges),

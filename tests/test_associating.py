@@ -4,10 +4,13 @@ import dataclasses
 
 import pytest
 
+from fleet_seif.errors import RunError
 from scenarios.association import Association
 from scenarios.config import load_scenario
+from scenarios.report import evaluate
 from scenarios.source import record
 from tests.association_ceiling import ceiling
+from tests.fleets import run_virtual
 from tests.identities import DUPLICATES_MAX, Errors, SeedScore, VehicleScore, pooled_association, score
 
 SCENARIO = "three_air_vehicles_unknown"
@@ -56,6 +59,13 @@ def test_a_short_run_without_identities_is_nearly_as_good_as_with_them() -> None
     assert (row.association.precision or 0.0) >= 0.99
     assert (row.association.recall or 0.0) >= 0.9
     assert row.fused.ratio < 2.0
+
+
+def test_doubtful_vehicles_are_not_fused_and_a_run_of_such_says_so() -> None:
+    run = run_virtual(SCENARIO, *SMALL, "filter.association={misfit_max=1e-9}", seed=101)
+    assert run.ledger.lives() == ()
+    with pytest.raises(RunError, match="no vehicle is part of the map; doubtful by their own word: v1, v2, v3"):
+        evaluate(run)
 
 
 def test_from_true_poses_almost_every_sighting_is_told() -> None:
