@@ -72,10 +72,12 @@ class FrameLog:
         if len(signature):
             self.sightings.append((len(self.motions), signature, z, Z))
 
-    def rename(self, old: int, new: int) -> None:
-        """Sightings of one signature have another from now on."""
-        for _, names, _, _ in self.sightings:
-            names[names == old] = new
+    def rename(self, old: int, new: int, least: int = 1) -> None:
+        """Sightings of one signature have another from now on; where there are fewer than `least`, none."""
+        found = [(names, names == old) for _, names, _, _ in self.sightings if old in names]
+        few = sum(int(np.count_nonzero(same)) for _, same in found) < least
+        for names, same in found:
+            names[same] = NONE if few else new
 
     def decided_again(self, model: int, poses: Floats, signatures: Ints, landmarks: Floats) -> bool:
         """Tell once more what sightings are of, now that the whole frame is known. Returns whether anything changed.
@@ -117,10 +119,6 @@ class FrameLog:
             names[open_[told]] = local.keys[free[found[told]]]
             changed |= len(told) > 0
         return changed
-
-    def count(self, signature: int) -> int:
-        """How many sightings are of it."""
-        return sum(int(np.count_nonzero(names == signature)) for _, names, _, _ in self.sightings)
 
     def state(self) -> tuple[Any, ...]:
         """Plain values for msgpack; `restored` takes them back."""

@@ -265,7 +265,7 @@ class FramedFilter:
         for key, number in decision.accepted.items():
             self._log.rename(key, number)
             for closed in (*self._looked_at, *self._closed):  # with one sighting of it, it has nothing to test that by
-                closed.log.rename(key, number if closed.log.count(key) > 1 else NONE)
+                closed.log.rename(key, number, least=2)
         new = (UNKNOWN_SIGNATURE,) * len(result.new)
         result = dataclasses.replace(
             result, new=new, innovation=decision.innovation, sightings=decision.dof // 2,

@@ -234,11 +234,6 @@ def kept(local: LocalMap, which: Ints) -> LocalMap:
     return LocalMap(local.mean[rows], local.P[np.ix_(rows, rows)], local.keys[which])
 
 
-def renamed(local: LocalMap, key: int, new: int) -> LocalMap:
-    """One landmark under another key."""
-    return replace(local, keys=np.where(local.keys == key, new, local.keys))
-
-
 @kernel
 def _seen_from(R_T: Floats, turn: Floats, P: Floats) -> Floats:
     """J P J' with J = [-R'  turn  R'] for each landmark, P (3 + 2 k, 3 + 2 k) pose first, turn (2 k,)."""

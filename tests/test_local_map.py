@@ -20,7 +20,6 @@ from fleet_seif.local_map import (
     kept,
     moved,
     nothing_known,
-    renamed,
     seen_from,
     sighted,
     with_new,
@@ -225,13 +224,6 @@ def test_what_is_kept_is_the_marginal_in_the_order_asked_for(case: Case, data: s
     rows = [0, 1, 2, *(3 + 2 * i + axis for i in chosen for axis in (0, 1))]
     assert np.array_equal(after.P, np.array([[local.P[i, j] for j in rows] for i in rows]))
     assert bits(local) == before
-
-
-def test_a_landmark_gets_another_key_and_the_others_keep_theirs() -> None:
-    local = LocalMap(np.zeros(9), np.eye(9), np.array([4, -7, 2]))
-    after = renamed(local, -7, 5)
-    assert after.keys.tolist() == [4, 5, 2]
-    assert local.keys.tolist() == [4, -7, 2]
 
 
 def from_pose(local: LocalMap, i: int) -> Floats:
