@@ -171,7 +171,7 @@ class LongRun(Merging):
     pass
 
 
-RUNS = int(os.environ.get("FLEET_SEIF_MERGE_RUNS", "1000"))
+RUNS = int(os.environ.get("FLEET_SEIF_MERGE_RUNS", "500"))
 """Of the long run, about an eighth of a second each: more of them by hand."""
 LongRun.TestCase.settings = settings(Merging.TestCase.settings, max_examples=RUNS)
 test_nodes_of_equal_content_merge_alike_in_many_runs = pytest.mark.slow(pytest.mark.timeout(7200)(LongRun.TestCase))
