@@ -17,7 +17,6 @@ from fusion.merges import merges_of
 from scenarios import output
 from scenarios.association import Truths, assigned_truth, associate, fleet_association
 from scenarios.config import Scenario
-from scenarios.figure import draw_figure, figure_times
 from scenarios.history import meetings, pose_times, replay, uncertainty_of
 from scenarios.recording import Recording
 from scenarios.score import MapScore, score_map, score_vehicle
@@ -137,6 +136,8 @@ def _us(seconds: Floats, percentile: float) -> float | None:
 
 def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
     """Everything the README promises, into a folder made by output.prepare_folder."""
+    from scenarios.figure import draw_figure, figure_times  # every process of a fleet would wait for matplotlib
+
     for name, log in run.recording.logs.items():
         output.write_readings(folder, log, run.drives[name].assigned)
         output.write_trajectory(folder / "trajectory" / f"{name}.tum", log.time_s, run.drives[name].pose)

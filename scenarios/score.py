@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.stats
+from scipy.special import gammaincinv
 
 from fleet_seif.joint import JointSolution, landmark_chi_square
 from fleet_seif.records import Floats, Ints
@@ -19,7 +19,7 @@ BAND: Final = 0.95
 
 def chi_square_band(dof: int) -> tuple[float, float]:
     """Between which a mean of squared normalised errors per degree of freedom lies with probability BAND."""
-    low, high = (float(scipy.stats.chi2.ppf(p, dof)) / dof for p in ((1 - BAND) / 2, (1 + BAND) / 2))
+    low, high = (2.0 * float(gammaincinv(dof / 2, p)) / dof for p in ((1 - BAND) / 2, (1 + BAND) / 2))
     return low, high
 
 

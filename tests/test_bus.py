@@ -302,6 +302,7 @@ def _p99_ms(sender: Bus, key: str, latencies_s: "list[float]", seconds: float) -
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_frozen_subscriber_of_a_flood_does_not_delay_others(start: Callable[..., Process]) -> None:
     router = start("router", ANY_PORT)
     victim = start("victim", "-", router.endpoint)

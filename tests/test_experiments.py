@@ -35,7 +35,7 @@ from scenarios.experiments.measures import (
     relative_map,
     seif,
 )
-from scenarios.experiments.names import EXPERIMENTS, run_experiment
+from scenarios.experiments.names import EXPERIMENTS, find_experiment, run_experiment
 from scenarios.experiments.study import Row, csv_of, png_of, summary_of, write_csv, write_summary
 from scenarios.experiments.worlds import World, compass_world, paper_world
 from scenarios.score import chi_square_band
@@ -43,8 +43,8 @@ from tests.processes import invoke, refused
 from tests.strategies import settled
 
 LANDMARKS, STEPS = 15, 120
-SLOW = pytest.mark.slow
-QUICKLY = [pytest.param(name, marks=SLOW if name == "cost" else []) for name in EXPERIMENTS]
+SLOW = [pytest.mark.slow]
+QUICKLY = [pytest.param(name, marks=[*SLOW, pytest.mark.alone] if name == "cost" else []) for name in EXPERIMENTS]
 AGAIN = [pytest.param(name, marks=[] if name == "correlation" else SLOW) for name in EXPERIMENTS]
 angles = st.floats(-3.0, 3.0)
 metres = st.floats(-5.0, 5.0)
@@ -184,7 +184,7 @@ def test_in_the_linear_world_the_ekf_is_consistent() -> None:
     assert low < np.average([each.nees_global for each in of], weights=[each.seen for each in of]) < high
 
 
-@SLOW
+@pytest.mark.slow
 def test_in_the_linear_world_eseif_is_consistent_and_a_very_sparse_seif_is_not() -> None:
     outcomes = linear_nees([eseif(6), eseif(10), seif(4)], 100, 50, 1000)
     low, high = chi_square_band(100 * 100)
@@ -221,7 +221,7 @@ def table_of(path: Path) -> list[dict[str, object]]:
 def quick(name: str, out: Path, seed: int = 1) -> list[tuple[int, int]]:
     """Run an experiment quickly; what it said of its progress."""
     told: list[tuple[int, int]] = []
-    run_experiment(EXPERIMENTS[name], out, seed, True, lambda done, total: told.append((done, total)))
+    run_experiment(find_experiment(name), out, seed, True, lambda done, total: told.append((done, total)))
     return told
 
 

@@ -116,6 +116,7 @@ def cable() -> Iterator[Cable]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("cut_s", CUTS_S)
 def test_a_fleet_is_complete_soon_after_a_partition(cable: Cable, tmp_path: Path, cut_s: int) -> None:

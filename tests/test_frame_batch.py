@@ -532,6 +532,7 @@ def test_simulated_frames_are_solved_from_odometry_alone_and_lose_nothing() -> N
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_frame_is_closed_in_milliseconds() -> None:
     for length, limit_ms in ((25, 10.0), (50, 20.0), (200, 80.0)):
         took = []

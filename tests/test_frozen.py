@@ -33,13 +33,15 @@ from tests.processes import Child, Fleet, fleet_of, wait_until
 from vehicles import Vehicle
 from vehicles.core import Identity, VehicleCore
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(180)]
 SETTINGS = ("fleet.vehicles=3", "world.steps=1500", "fusion.ack_every=1", "run.rate_hz=20")
 RATE_HZ = 20.0
 PHASE_S = 6.0
 SETTLE_S = 2.0
 FACTOR = 2.0
-FLOOR_S = 0.02
+FLOOR_S = 2.0 / RATE_HZ
+"""Two periods of a vehicle: what a scheduler may add where three processes share two busy cores (0.08 s was seen). With
+one queue for all sources, acknowledgements take 0.23 s (95 %) under valid messages, 3.7 s under continued ones."""
 FLOOD_HZ = 3000
 BATCH = 30
 EPOCHS = 200

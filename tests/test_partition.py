@@ -15,7 +15,7 @@ import pytest
 from fleet_seif.bus import LEASE_MS, open_bus
 from tests.netns import ADDRESS, Cable, two_namespaces, unavailable
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 HUB = f"tcp/{ADDRESS['a']}:7447"
 PATIENCE_S = 10.0
 BACK_S = 2.5  # a lost SYN costs OPEN_MS and a wait of RETRY_MS

@@ -17,7 +17,7 @@ from scenarios.source import record
 from tests.bytes_per_step import table
 from vehicles import Vehicle
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 
 def timed_drive(landmarks: int, frames: Literal["single", "adaptive"]) -> tuple[Floats, Ints]:

@@ -23,7 +23,7 @@ from scenarios.config import load_scenario
 from scenarios.source import record
 from vehicles.core import Identity, VehicleCore
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 GROUP = 256
 STEPS = 2000
 
