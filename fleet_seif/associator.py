@@ -81,7 +81,8 @@ class Decision:
 
 
 class Associator:
-    """See the rules above. travel_max_m: how far from the frame's start the local map is whole."""
+    """See the rules above. travel_max_m: how far from the frame's start the local map is whole. barred: landmarks that
+    are not compared with sightings, however well their places are known."""
 
     def __init__(self, settings: AssociationSettings, model: int) -> None:
         self.settings = settings
@@ -95,6 +96,14 @@ class Associator:
         self._began = -1
         self._together: Counter[tuple[int, int]] = Counter()
         self._apart: dict[int, float] = {}
+        self.barred: frozenset[int] = frozenset()
+
+    def anew(self) -> "Associator":
+        """One that has met what this one has, and knows of no provisional landmark."""
+        other = Associator(self.settings, self.model)
+        other.reach_m, other._next = self.reach_m, self._next
+        other._last, other._together = dict(self._last), self._together.copy()
+        return other
 
     @one_thread
     def decide(self, step: int, motion: tuple[Floats, Floats] | None, z: Floats, Z: Floats, known: int) -> Decision:
@@ -129,6 +138,8 @@ class Associator:
     def _is_doubtful(self, local: LocalMap, i: int, step: int) -> bool:
         """Rule 3, of the landmark at position i."""
         key = int(local.keys[i])
+        if key in self.barred:
+            return True
         if key < 0 or self._last.get(key, step) > self._began:
             return False
         return 2.0 * DOUBTFUL_SIGMAS * from_pose_std(local.P, i) > self._apart.get(key, np.inf)

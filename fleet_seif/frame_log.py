@@ -72,6 +72,11 @@ class FrameLog:
         if len(signature):
             self.sightings.append((len(self.motions), signature, z, Z))
 
+    def untold(self) -> "FrameLog":
+        """The same readings, of which none is known what it is of."""
+        seen = [(step, np.full(len(names), NONE), z, Z) for step, names, z, Z in self.sightings]
+        return FrameLog(list(self.motions), seen, self.heading_variance)
+
     def rename(self, old: int, new: int, least: int = 1) -> None:
         """Sightings of one signature have another from now on; where there are fewer than `least`, none."""
         found = [(names, names == old) for _, names, _, _ in self.sightings if old in names]

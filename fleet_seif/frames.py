@@ -12,23 +12,22 @@
 7. Where nothing tells which landmark a sighting is of (identities = "associated"), an Associator decides, against what
    the closed frames say about where the open one starts and what lies around it (own_map). Where too many landmarks may
    be another one, or the frames do not fit each other, the vehicle has probably taken some for their neighbours: it is
-   doubtful until a frame closes after which neither is so.
+   doubtful until a frame closes after which neither is so. Or until it finds a way back: what the sightings of the
+   last frames are of is told anew (way_back), and where that looks right these frames are corrected.
 """
 
 import dataclasses
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from fleet_seif.associator import Associator, Decision
+from fleet_seif.closed_frames import Closed, join
 from fleet_seif.config import FilterSettings
 from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.errors import NumericalError
 from fleet_seif.filters import Names, StepResult, checked_reading
-from fleet_seif.frame_deltas import quantised
 from fleet_seif.frame_log import NONE, FrameLog
 from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
@@ -36,13 +35,20 @@ from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes,
 from fleet_seif.local_map import begun_at, kept
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
-from fleet_seif.own_map import OwnMap, first_names
+from fleet_seif.own_map import OwnMap
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 from fleet_seif.seif import Seif, Taken
+from fleet_seif.way_back import ToldAnew, told_anew
 
 log = logging.getLogger(__name__)
 AGAIN_FRAMES = 4
 """A frame is looked at again when so many more have closed."""
+KEPT_FRAMES = 16
+"""Closed frames whose readings are kept, while the vehicle is sound; where it is doubtful, those since, too."""
+KEPT_FRAMES_MAX = 64
+"""Closed frames whose readings are kept at most."""
+CORRECTIONS_EACH = 16
+"""Frames that are corrected with one step, on the way back from doubt."""
 FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
 
@@ -55,38 +61,8 @@ def _told(seen: Sightings, decision: Decision | None) -> Sightings:
     return Sightings(z=np.asarray(seen.z)[told], cov=np.asarray(seen.cov)[told], signature=decision.keys[told])
 
 
-@dataclass
-class Closed:
-    """A frame that has ended and is to be corrected at step `due`.
-
-    landmarks (n, 2): as estimated last; signatures, numbers (n,): theirs, and how they are called in the life.
-    poses (T, 3): as its batch has found them; none before.
-    """
-
-    frame: int
-    due: int
-    log: FrameLog
-    landmarks: Floats
-    signatures: Ints
-    numbers: Ints
-    poses: Floats = field(default_factory=lambda: np.empty((0, 3)))
-
-    def state(self) -> tuple[Any, ...]:
-        """Plain values for msgpack; `restored` takes them back."""
-        arrays = (self.landmarks, self.signatures, self.numbers, self.poses)
-        return (self.frame, self.due, self.log.state(), *(array.tobytes() for array in arrays))
-
-    @staticmethod
-    def restored(state: tuple[Any, ...]) -> "Closed":
-        frame, due, log_, landmarks, signatures, numbers, poses = state
-        return Closed(
-            frame, due, FrameLog.restored(log_), np.frombuffer(landmarks).reshape(-1, 2),
-            np.frombuffer(signatures, np.int64), np.frombuffer(numbers, np.int64), np.frombuffer(poses).reshape(-1, 3),
-        )  # fmt: skip
-
-
 class FramedFilter:
-    """See the rules above. doubtful: when the last frame closed, this vehicle's map did not look right (rule 7)."""
+    """See the rules above."""
 
     def __init__(self, settings: FilterSettings, model: int = RANGE_BEARING) -> None:
         self.settings = settings
@@ -104,12 +80,15 @@ class FramedFilter:
         if not self._single:
             most = min(settings.landmarks_max, FRAME_LANDMARKS_MAX)
             self._frame_settings = settings.model_copy(update={"landmarks_max": most})
+        self._kept: list[Closed] = []
         self._closed: list[Closed] = []
         self._looked_at: list[Closed] = []
         self._late: list[FramePart] = []
         self._associator = Associator(settings.association, model) if settings.identities == "associated" else None
         self._own_map = OwnMap()
-        self.doubtful = False
+        self._doubtful_since: int | None = None
+        self._to_correct: dict[int, tuple[FrameDelta, Floats]] = {}
+        self._begun: list[tuple[int, int]] = []
         self._new_aliases: list[tuple[int, int, bool]] = []
         self._assigned: list[Ints] = []
         self._open()
@@ -119,6 +98,11 @@ class FramedFilter:
         self.filter = Seif(self._frame_settings, self.model, None if self._single else self._names)
         self._log = FrameLog()
         self._opened = False
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether this vehicle's map did not look right when the last frame closed (rule 7), or still is corrected."""
+        return self._doubtful_since is not None or bool(self._to_correct)
 
     @property
     def signatures(self) -> list[int]:
@@ -132,7 +116,7 @@ class FramedFilter:
         """Which landmark each sighting taken so far is of, by number, -1 none, shape (s,)."""
         keys = np.concatenate([*self._assigned, np.empty(0, np.int64)]).astype(np.int64)
         if self._associator is not None:
-            first = first_names(self._own_map.aliases, len(self._names.signatures))
+            first = self._own_map.first_names(len(self._names.signatures))
             return np.array([first[key] if key >= 0 else NONE for key in keys.tolist()], np.int64)
         numbers = {signature: number for number, signature in enumerate(self.signatures)}
         return np.array([numbers[key] for key in keys.tolist()], np.int64)
@@ -255,7 +239,7 @@ class FramedFilter:
         while self._closed and self._closed[0].due <= self.steps:
             parts += self._corrected(self._closed.pop(0))
         late, self._late = self._late, []
-        return result, (*parts, *late)
+        return result, (*parts, *late, *self._corrections())
 
     def _take_decision(self, decision: Decision, result: StepResult, seen: Sightings) -> tuple[StepResult, Taken]:
         """What sightings were taken for holds from now on: the step as published, and as it is kept."""
@@ -285,29 +269,35 @@ class FramedFilter:
     def _close(self) -> Floats:
         """End the open frame where it is now, so that the next step begins another; its last pose."""
         end_pose = self.filter.pose
-        due = self.steps + self.settings.close_lag_steps
         live = self.filter
-        signatures = np.array(live.signatures, np.int64)
-        self._closed.append(Closed(self.frame, due, self._log, live.landmarks, signatures, live.called))
+        self._kept.append(
+            Closed(
+                frame=self.frame,
+                due=self.steps + self.settings.close_lag_steps,
+                log=self._log,
+                landmarks=live.landmarks,
+                signatures=np.array(live.signatures, np.int64),
+                numbers=live.called,
+                first_step=self.steps - len(self._log.motions),
+                aliases=len(self._own_map.aliases),
+            )
+        )
+        self._closed.append(self._kept[-1])
         self.totals.append(FrameTotal())
         self.totals[-1].add(live.published())
         self.ends.append(end_pose)
         if self._associator is not None:
-            self._look_around(self._closed[-1], self._associator)
+            self._look_around(self._kept[-1], self._associator)
+        self._forget()
         self._open()
         return end_pose
 
     def _look_around(self, closed: Closed, associator: Associator) -> None:
         """What lies around the end of a frame that closes, for the next."""
-        duplicates = associator.duplicates()
-        self._alias(duplicates.pairs)
-        for other, one in enumerate(first_names(self._own_map.aliases, len(self._names.signatures)).tolist()):
-            if one != other:
-                closed.log.rename(other, one)
-        solved = self._solved(closed)
-        self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
+        before, own = set(self._own_map.aliases), self._own_map
+        duplicates, _ = join(closed, associator, own, self.settings, self.model, self.totals[closed.frame].delta())
         try:
-            near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
+            near = own.around(self.settings.association.local_landmarks_max, associator.reach_m)
         except NumericalError as error:
             log.warning("own_map_not_solved frame=%d reason=%s", closed.frame, error)
             local = associator.local
@@ -315,46 +305,80 @@ class FramedFilter:
         associator.begin(self.steps, *near)
         while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
             self._late += self._looked_at_again(self._looked_at.pop(0))
-        limits = self.settings.association
-        self.doubtful = duplicates.unclear > limits.unclear_max or self._own_map.misfit > limits.misfit_max
+        if not self._looks_wrong(duplicates.unclear, own):
+            self._doubtful_since = None
+        elif self._doubtful_since is None:
+            self._doubtful_since = closed.frame
+        else:
+            self._find_way_back(closed.frame, self._doubtful_since, associator)
+        self._note_aliases(before)
 
-    def _alias(self, pairs: Sequence[tuple[int, int]]) -> None:
-        """Landmarks that are one from now on."""
-        for pair in pairs:
-            one, other = min(pair), max(pair)
-            if (one, other) in self._own_map.aliases:
-                continue
-            self._own_map.aliases.append((one, other))
-            self._new_aliases.append((one, other, True))
+    def _looks_wrong(self, unclear: float, own: OwnMap) -> bool:
+        limits = self.settings.association
+        return unclear > limits.unclear_max or own.misfit > limits.misfit_max
+
+    def _find_way_back(self, frame: int, since: int, associator: Associator) -> None:
+        """Tell the last frames anew, from the further back the longer the doubt lasts; take it where it looks right."""
+        doubtful = frame - since
+        if doubtful & (doubtful - 1):  # after 1, 2, 4, 8 frames, ...
+            return
+        first = max(since - min(2 * doubtful, KEPT_FRAMES), 0)
+        again = [closed for closed in self._kept if closed.frame >= first]
+        if again[0].frame > first:
+            return
+        known = len(self._names.signatures)
+        found = told_anew(again, self._own_map, associator, self.settings, self.model, known)
+        if found is not None and not self._looks_wrong(found.unclear, found.own_map):
+            log.info("way_back frame=%d doubtful_since=%d told_anew_from=%d", frame, since, first)
+            self._take_back(again, found)
+
+    def _take_back(self, before: list[Closed], found: ToldAnew) -> None:
+        """What was told anew holds from now on; its corrections are to be published."""
+        news = dict(zip(map(id, before), found.frames, strict=True))
+        for old, new in zip(before, found.frames, strict=True):
+            for i, ((step, names, z, Z), (_, told, _, _)) in enumerate(zip(old.log.sightings, new.log.sightings)):
+                names[:] = told  # the array that `assigned` has, too
+                new.log.sightings[i] = step, names, z, Z
+        self._kept, self._closed, self._looked_at = (
+            [news.get(id(closed), closed) for closed in frames]
+            for frames in (self._kept, self._closed, self._looked_at)
+        )
+        count = len(self._names.signatures)
+        self._names.add(list(range(count, found.known)))
+        self._begun += [(number, UNKNOWN_SIGNATURE) for number in range(count, found.known)]
+        self._own_map, self._associator, self._doubtful_since = found.own_map, found.associator, None
+        self._to_correct |= {closed.frame: each for closed, each in zip(found.frames, found.solved, strict=True)}
+
+    def _forget(self) -> None:
+        """Readings that are not needed any more."""
+        needed, first = {id(closed) for closed in (*self._closed, *self._looked_at)}, self.frame
+        if self._associator is not None:
+            sound = self.frame if self._doubtful_since is None else self._doubtful_since
+            first = max(sound - KEPT_FRAMES, self.frame - KEPT_FRAMES_MAX)
+        self._kept = [closed for closed in self._kept if closed.frame >= first or id(closed) in needed]
+
+    def _corrections(self) -> list[FramePart]:
+        """Some of what was told anew."""
+        parts = []
+        for frame in sorted(self._to_correct)[:CORRECTIONS_EACH]:
+            parts += self._replaced(frame, *self._to_correct[frame])
+        return parts
+
+    def _note_aliases(self, before: set[tuple[int, int]]) -> None:
+        """Pairs of landmarks that are one since then, or not any more."""
+        now = set(self._own_map.aliases)
+        self._new_aliases += [(a, b, True) for a, b in sorted(now - before)]
+        self._new_aliases += [(a, b, False) for a, b in sorted(before - now)]
+
+    def take_begun(self) -> tuple[tuple[int, int], ...]:
+        """Landmarks, and their signatures, that came to be on the way back from doubt, after those of the last step."""
+        taken, self._begun = tuple(self._begun), []
+        return taken
 
     def take_aliases(self) -> tuple[tuple[int, int, bool], ...]:
         """Pairs of landmarks that have become one, or are not any more, since the last call: to be published."""
         taken, self._new_aliases = tuple(self._new_aliases), []
         return taken
-
-    def _solved(self, closed: Closed) -> tuple[FrameDelta, Floats] | None:
-        """The batch over a closed frame as one cumulative delta, and its end pose; None where it fails."""
-        if not closed.log.motions:
-            return None
-        signatures, landmarks, numbers = closed.signatures, closed.landmarks, closed.numbers
-        if self._associator is not None:
-            signatures, landmarks = closed.log.guesses(self.model, signatures, landmarks)
-            numbers = signatures
-        try:
-            batch = closed.log.solved(self.model, signatures, landmarks, self.settings.frame_huber)
-            if self._associator is not None:
-                known = signatures[batch.seen], batch.mean[3:].reshape(-1, 2)[batch.seen]
-                if closed.log.decided_again(self.model, batch.poses, *known):
-                    batch = closed.log.solved(self.model, signatures, landmarks, self.settings.frame_huber)
-            closed.poses = batch.poses
-            order = np.argsort(numbers)
-            order = order[batch.seen[order]]
-            rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
-            variables = np.concatenate([[0], 1 + numbers[order]]).astype(np.int64)
-            H, b, mean = batch.H[np.ix_(rows, rows)], batch.b[rows], batch.mean[rows]
-            return quantised(variables, H, b, mean), batch.mean[:3]
-        except NumericalError:
-            return None
 
     def _corrected(self, closed: Closed) -> list[FramePart]:
         """The correction of a frame, which is looked at again later where sightings are associated."""
@@ -373,11 +397,13 @@ class FramedFilter:
 
     def _correction(self, closed: Closed) -> list[FramePart]:
         """What the batch over a closed frame changes, to be published; nothing where it fails, or nothing moved."""
-        solved, total = self._solved(closed), self.totals[closed.frame]
-        if solved is None:
-            return []
-        whole, end_pose = solved
-        change = FrameTotal()
+        solved = closed.solved(self.settings, self.model)
+        return [] if solved is None else self._replaced(closed.frame, *solved)
+
+    def _replaced(self, frame: int, whole: FrameDelta, end_pose: Floats) -> list[FramePart]:
+        """The correction after which a frame says this, and ends there."""
+        self._to_correct.pop(frame, None)
+        total, change = self.totals[frame], FrameTotal()
         try:
             change.add(whole)
             change.subtract(total.delta())
@@ -385,10 +411,10 @@ class FramedFilter:
             return []
         delta = change.delta()
         total.add(delta)
-        self.ends[closed.frame] = end_pose
+        self.ends[frame] = end_pose
         if self._associator is not None:
-            self._own_map.put(closed.frame, whole)
-        return [FramePart(frame=closed.frame, status=FrameStatus.CORRECTED, delta=delta, end_pose=end_pose)]
+            self._own_map.put(frame, whole)
+        return [FramePart(frame=frame, status=FrameStatus.CORRECTED, delta=delta, end_pose=end_pose)]
 
     def end(self) -> tuple[FramePart, ...]:
         """Close the open frame and correct all that is outstanding."""
@@ -402,7 +428,9 @@ class FramedFilter:
         for closed in self._looked_at:
             parts += self._looked_at_again(closed)
         parts += self._late
-        self._closed, self._looked_at, self._late = [], [], []
+        while self._to_correct:
+            parts += self._corrections()
+        self._kept, self._closed, self._looked_at, self._late = [], [], [], []
         self._localised = self.steps - self.settings.localise_steps
         return tuple(parts)
 
@@ -417,10 +445,14 @@ class FramedFilter:
             return state
         return {
             **state, "signatures": list(self._names.signatures), "log": self._log.state(),
-            "closed": [each.state() for each in self._closed],
-            "looked_at": [each.state() for each in self._looked_at],
+            "kept": [each.state() for each in self._kept],
+            "closed": [each.frame for each in self._closed],
+            "looked_at": [each.frame for each in self._looked_at],
             "totals": [pack_delta(total.delta()) for total in self.totals],
-            "doubtful": self.doubtful, "new_aliases": list(self._new_aliases), "own": self._own_map.state(),
+            "doubtful_since": self._doubtful_since, "own": self._own_map.state(),
+            "to_correct": [
+                (frame, pack_delta(whole), end.tobytes()) for frame, (whole, end) in self._to_correct.items()
+            ],
             "ends": np.array(self.ends).tobytes(),
         }  # fmt: skip
 
@@ -437,14 +469,16 @@ class FramedFilter:
             return
         self._localised = self.steps - self.settings.localise_steps
         self._log = FrameLog.restored(state["log"])
-        self._closed = [Closed.restored(each) for each in state["closed"]]
-        self._looked_at = [Closed.restored(each) for each in state["looked_at"]]
+        self._kept = [Closed.restored(each) for each in state["kept"]]
+        by_frame = {closed.frame: closed for closed in self._kept}
+        self._closed = [by_frame[frame] for frame in state["closed"]]
+        self._looked_at = [by_frame[frame] for frame in state["looked_at"]]
         self._share_keys()
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
-        self.doubtful = state["doubtful"]
-        self._new_aliases = [(a, b, added) for a, b, added in state["new_aliases"]]
+        self._doubtful_since = state["doubtful_since"]
+        self._to_correct = {frame: (read_delta(whole), np.frombuffer(end)) for frame, whole, end in state["to_correct"]}
         self._own_map.restore(state["own"])
         self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
 
@@ -452,7 +486,7 @@ class FramedFilter:
         """What sightings are taken for is kept once: by the logs of frames and by `assigned`."""
         if self._associator is None:
             return
-        (keys,), logs = self._assigned, [closed.log for closed in (*self._looked_at, *self._closed)]
+        (keys,), logs = self._assigned, [closed.log for closed in self._kept]
         logs.append(self._log)
         at = len(keys) - sum(len(names) for each in logs for _, names, _, _ in each.sightings)
         for each in logs:

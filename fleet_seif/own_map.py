@@ -39,6 +39,23 @@ class OwnMap:
             self.frames.append(total)
         self.frames[frame] = total
 
+    def join(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Landmarks that are one from now on."""
+        for pair in pairs:
+            one, other = min(pair), max(pair)
+            if (one, other) not in self.aliases:
+                self.aliases.append((one, other))
+
+    def first_names(self, count: int = 0) -> Ints:
+        """The least number of all that are one landmark, for each number below `count` and all in a pair."""
+        return first_names(self.aliases, max(count, 1 + max((b for _, b in self.aliases), default=-1)))
+
+    def until(self, frame: int, aliases: int) -> "OwnMap":
+        """The map of the frames before this one alone, with the first so many pairs; solved from scratch."""
+        earlier = OwnMap()
+        earlier.frames, earlier.aliases = self.frames[:frame], self.aliases[:aliases]
+        return earlier
+
     @one_thread
     def around(self, most: int, reach_m: float) -> tuple[LocalMap, float]:
         """The landmarks around the end of the last frame, as seen from there, and how far they are all there are.
