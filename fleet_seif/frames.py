@@ -261,11 +261,11 @@ class FramedFilter:
         """What sightings were taken for holds from now on: the step as published, and as it is kept."""
         assert self._associator is not None
         z, Z = np.array(seen.z, float), np.array(seen.cov, float)
-        self._associator.take(self.steps, decision, z)
+        self._associator.take(decision, z)
         for key, number in decision.accepted.items():
-            self._log.rename(key, number)
+            self._log.accept(key, number)
             for closed in (*self._looked_at, *self._closed):  # with one sighting of it, it has nothing to test that by
-                closed.log.rename(key, number, least=2)
+                closed.log.accept(key, number, least=2)
         new = (UNKNOWN_SIGNATURE,) * len(result.new)
         result = dataclasses.replace(
             result, new=new, innovation=decision.innovation, sightings=decision.dof // 2,
@@ -301,9 +301,7 @@ class FramedFilter:
         """What lies around the end of a frame that closes, for the next."""
         duplicates = associator.duplicates()
         self._alias(duplicates.pairs)
-        for other, one in enumerate(first_names(self._own_map.aliases, len(self._names.signatures)).tolist()):
-            if one != other:
-                closed.log.rename(other, one)
+        closed.log.rename(first_names(self._own_map.aliases, len(self._names.signatures)))
         solved = self._solved(closed)
         self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
         try:
@@ -312,7 +310,7 @@ class FramedFilter:
             log.warning("own_map_not_solved frame=%d reason=%s", closed.frame, error)
             local = associator.local
             near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
-        associator.begin(self.steps, *near)
+        associator.begin(*near)
         while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
             self._late += self._looked_at_again(self._looked_at.pop(0))
         limits = self.settings.association
