@@ -12,7 +12,7 @@ from fleet_seif.frame_deltas import quantised
 from fleet_seif.frame_log import FrameLog
 from fleet_seif.information import FrameDelta
 from fleet_seif.own_duplicates import Duplicates
-from fleet_seif.own_map import OwnMap
+from fleet_seif.own_map import OwnMap, first_names
 from fleet_seif.records import Floats, Ints
 
 
@@ -80,20 +80,24 @@ class Closed:
 
 
 def join(
-    closed: Closed, associator: Associator, own_map: OwnMap, settings: FilterSettings, model: int, total: FrameDelta
+    closed: Closed,
+    associator: Associator,
+    own_map: OwnMap,
+    settings: FilterSettings,
+    model: int,
+    known: int,
+    total: FrameDelta,
 ) -> tuple[Duplicates, tuple[FrameDelta, Floats] | None]:
     """Put a frame that has just ended into the own map; landmarks that were begun twice are one from now on.
 
     Returns those landmarks, and what the batch over the frame has found.
 
     Args:
-        total: what the frame says where its batch fails.
+        known: landmarks that have a number. total: what the frame says where its batch fails.
     """
     duplicates = associator.duplicates()
     own_map.join(duplicates.pairs)
-    for other, one in enumerate(own_map.first_names().tolist()):
-        if one != other:
-            closed.log.rename(other, one)
+    closed.log.rename(first_names(own_map.aliases, known))
     solved = closed.solved(settings, model)
     own_map.put(closed.frame, total if solved is None else solved[0])
     return duplicates, solved

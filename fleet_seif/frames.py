@@ -35,7 +35,7 @@ from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes,
 from fleet_seif.local_map import begun_at, kept
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
-from fleet_seif.own_map import OwnMap
+from fleet_seif.own_map import OwnMap, first_names
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 from fleet_seif.seif import Seif, Taken
 from fleet_seif.way_back import ToldAnew, told_anew
@@ -116,7 +116,7 @@ class FramedFilter:
         """Which landmark each sighting taken so far is of, by number, -1 none, shape (s,)."""
         keys = np.concatenate([*self._assigned, np.empty(0, np.int64)]).astype(np.int64)
         if self._associator is not None:
-            first = self._own_map.first_names(len(self._names.signatures))
+            first = first_names(self._own_map.aliases, len(self._names.signatures))
             return np.array([first[key] if key >= 0 else NONE for key in keys.tolist()], np.int64)
         numbers = {signature: number for number, signature in enumerate(self.signatures)}
         return np.array([numbers[key] for key in keys.tolist()], np.int64)
@@ -245,11 +245,11 @@ class FramedFilter:
         """What sightings were taken for holds from now on: the step as published, and as it is kept."""
         assert self._associator is not None
         z, Z = np.array(seen.z, float), np.array(seen.cov, float)
-        self._associator.take(self.steps, decision, z)
+        self._associator.take(decision, z)
         for key, number in decision.accepted.items():
-            self._log.rename(key, number)
+            self._log.accept(key, number)
             for closed in (*self._looked_at, *self._closed):  # with one sighting of it, it has nothing to test that by
-                closed.log.rename(key, number, least=2)
+                closed.log.accept(key, number, least=2)
         new = (UNKNOWN_SIGNATURE,) * len(result.new)
         result = dataclasses.replace(
             result, new=new, innovation=decision.innovation, sightings=decision.dof // 2,
@@ -295,21 +295,22 @@ class FramedFilter:
     def _look_around(self, closed: Closed, associator: Associator) -> None:
         """What lies around the end of a frame that closes, for the next."""
         before, own = set(self._own_map.aliases), self._own_map
-        duplicates, _ = join(closed, associator, own, self.settings, self.model, self.totals[closed.frame].delta())
+        known, total = len(self._names.signatures), self.totals[closed.frame].delta()
+        duplicates, _ = join(closed, associator, own, self.settings, self.model, known, total)
         try:
             near = own.around(self.settings.association.local_landmarks_max, associator.reach_m)
         except NumericalError as error:
             log.warning("own_map_not_solved frame=%d reason=%s", closed.frame, error)
             local = associator.local
             near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
-        associator.begin(self.steps, *near)
+        associator.begin(*near)
         while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
             self._late += self._looked_at_again(self._looked_at.pop(0))
         if not self._looks_wrong(duplicates.unclear, own):
             self._doubtful_since = None
-        elif self._doubtful_since is None:
-            self._doubtful_since = closed.frame
         else:
+            if self._doubtful_since is None:
+                self._doubtful_since = closed.frame
             self._find_way_back(closed.frame, self._doubtful_since, associator)
         self._note_aliases(before)
 
@@ -319,8 +320,8 @@ class FramedFilter:
 
     def _find_way_back(self, frame: int, since: int, associator: Associator) -> None:
         """Tell the last frames anew, from the further back the longer the doubt lasts; take it where it looks right."""
-        doubtful = frame - since
-        if doubtful & (doubtful - 1):  # after 1, 2, 4, 8 frames, ...
+        doubtful = frame - since + 1
+        if doubtful & (doubtful - 1):  # 1, 2, 4, 8 frames, ...
             return
         first = max(since - min(2 * doubtful, KEPT_FRAMES), 0)
         again = [closed for closed in self._kept if closed.frame >= first]

@@ -46,10 +46,6 @@ class OwnMap:
             if (one, other) not in self.aliases:
                 self.aliases.append((one, other))
 
-    def first_names(self, count: int = 0) -> Ints:
-        """The least number of all that are one landmark, for each number below `count` and all in a pair."""
-        return first_names(self.aliases, max(count, 1 + max((b for _, b in self.aliases), default=-1)))
-
     def until(self, frame: int, aliases: int) -> "OwnMap":
         """The map of the frames before this one alone, with the first so many pairs; solved from scratch."""
         earlier = OwnMap()

@@ -16,10 +16,11 @@ from fleet_seif.associator import Associator
 from fleet_seif.closed_frames import Closed, join
 from fleet_seif.config import FilterSettings
 from fleet_seif.errors import NumericalError
+from fleet_seif.frame_log import FrameLog
 from fleet_seif.information import FrameDelta
 from fleet_seif.local_map import nothing_known
 from fleet_seif.own_map import OwnMap
-from fleet_seif.records import Floats, Ints, Sightings
+from fleet_seif.records import Floats, Sightings
 
 
 @dataclass(frozen=True)
@@ -48,53 +49,56 @@ def told_anew(
     solved: list[tuple[FrameDelta, Floats]] = []
     unclear = 0.0
     try:
-        _look_around(anew, own, frames[0].first_step, known)
+        _look_around(anew, own, known)
         for frame in frames:
-            log, none = frame.log.untold(), np.empty(0, np.int64)
-            closed = Closed(
-                frame.frame, frame.due, log, np.empty((0, 2)), none, none, frame.first_step, len(own.aliases)
+            none = np.empty(0, np.int64)
+            again.append(
+                Closed(
+                    frame=frame.frame,
+                    due=frame.due,
+                    log=FrameLog(),
+                    landmarks=np.empty((0, 2)),
+                    signatures=none,
+                    numbers=none,
+                    first_step=frame.first_step,
+                    aliases=len(own.aliases),
+                )
             )
-            again.append(closed)
-            most = _tell(closed, again, anew, most)
-            duplicates, found = join(closed, anew, own, settings, model, FrameDelta.nothing())
+            most = _tell(frame, again, anew, most)
+            duplicates, found = join(again[-1], anew, own, settings, model, most, FrameDelta.nothing())
             if found is None:
                 return None
             solved.append(found)
             unclear = duplicates.unclear
-            _look_around(anew, own, closed.first_step + len(log.motions), known)
+            _look_around(anew, own, known if frame is not frames[-1] else 0)
     except NumericalError:
         return None
-    anew.barred = frozenset()
     return ToldAnew(again, solved, own, anew, most, unclear)
 
 
-def _look_around(associator: Associator, own: OwnMap, step: int, known: int) -> None:
-    """Begin a frame after this step. Landmarks below `known` are barred, but for those that have been begun anew."""
+def _look_around(associator: Associator, own: OwnMap, known: int) -> None:
+    """Begin a frame. Landmarks below `known` are barred, but for those that have been begun anew."""
     if not own.frames:
-        associator.begin(step, nothing_known(), np.inf)
+        associator.begin(nothing_known(), np.inf)
         return
     near, travel_max_m = own.around(associator.settings.local_landmarks_max, associator.reach_m)
     met = {one for one, other in own.aliases if other >= known}
-    associator.barred = frozenset(key for key in near.keys.tolist() if key < known and key not in met)
-    associator.begin(step, near, travel_max_m)
+    barred = [key for key in near.keys.tolist() if key < known and key not in met]
+    associator.begin(near, travel_max_m, barred)
 
 
-def _tell(closed: Closed, frames: Sequence[Closed], associator: Associator, known: int) -> int:
-    """Tell what the sightings of a frame are of; landmarks that have a number then."""
-    log, none = closed.log, Sightings.none()
-    seen = {step: (names, z, Z) for step, names, z, Z in log.sightings}
-    nothing: tuple[Ints, Floats, Floats] = none.signature, none.z, none.cov
-    for k in range(0 if 0 in seen else 1, len(log.motions) + 1):
-        names, z, Z = seen.get(k, nothing)
-        step = closed.first_step + k
-        decision = associator.decide(step, log.motions[k - 1][:2] if k else None, z, Z, known)
-        associator.take(step, decision, z)
+def _tell(frame: Closed, again: Sequence[Closed], associator: Associator, known: int) -> int:
+    """Tell what the sightings of a frame are of, into the last of `again`; how many landmarks have a number then."""
+    log, none = again[-1].log, Sightings.none()
+    seen = {step: (z, Z) for step, _, z, Z in frame.log.sightings}
+    for k in range(0 if 0 in seen else 1, len(frame.log.motions) + 1):
+        z, Z = seen.get(k, (none.z, none.cov))
+        u, cov = frame.log.motions[k - 1][:2] if k else (np.zeros(3), np.eye(3))
+        decision = associator.decide(frame.first_step + k, (u, cov) if k else None, z, Z, known)
+        associator.take(decision, z)
         known += len(decision.accepted)
-        names[:] = decision.keys
+        log.add(k > 0, (u, cov, z, Z, decision.keys.copy()), decision.local.pose.copy())
         for key, number in decision.accepted.items():
-            for frame in frames:
-                frame.log.rename(key, number, least=1 if frame is closed else 2)
-        if k:
-            u, cov, _ = log.motions[k - 1]
-            log.motions[k - 1] = u, cov, decision.local.pose.copy()
+            for each in again:
+                each.log.accept(key, number, least=1 if each is again[-1] else 2)
     return known
