@@ -47,6 +47,10 @@ KEPT_FRAMES = 16
 """Closed frames whose readings are kept, while the vehicle is sound; where it is doubtful, those since, too."""
 KEPT_FRAMES_MAX = 64
 """Closed frames whose readings are kept at most."""
+BACK_UNCLEAR = 0.5
+"""Share of `unclear_max` up to which what was told anew is taken."""
+BACK_MISFIT = 1.1
+"""How many times the misfit before that of what was told anew may be; a misfit below 1 is none."""
 CORRECTIONS_EACH = 16
 """Frames that are corrected with one step, on the way back from doubt."""
 FRAME_LANDMARKS_MAX = 4096
@@ -318,6 +322,12 @@ class FramedFilter:
         limits = self.settings.association
         return unclear > limits.unclear_max or own.misfit > limits.misfit_max
 
+    def _looks_better(self, unclear: float, own: OwnMap) -> bool:
+        """Whether what was told anew looks right, by more than a hair, and its frames fit no worse than before."""
+        limits = self.settings.association
+        misfit_max = min(limits.misfit_max, BACK_MISFIT * max(self._own_map.misfit, 1.0))
+        return unclear <= BACK_UNCLEAR * limits.unclear_max and own.misfit <= misfit_max
+
     def _find_way_back(self, frame: int, since: int, associator: Associator) -> None:
         """Tell the last frames anew, from the further back the longer the doubt lasts; take it where it looks right."""
         doubtful = frame - since + 1
@@ -329,7 +339,7 @@ class FramedFilter:
             return
         known = len(self._names.signatures)
         found = told_anew(again, self._own_map, associator, self.settings, self.model, known)
-        if found is not None and not self._looks_wrong(found.unclear, found.own_map):
+        if found is not None and self._looks_better(found.unclear, found.own_map):
             log.info("way_back frame=%d doubtful_since=%d told_anew_from=%d", frame, since, first)
             self._take_back(again, found)
 
