@@ -7,6 +7,7 @@ so well known that it cannot be taken for a neighbour. How dense landmarks are i
 where many have been begun twice the nearest is the landmark itself.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -51,8 +52,9 @@ def own_duplicates(local: LocalMap, together: Callable[[int, int], bool], rules:
     S = _differences(local.P, rows[ends])
     d2 = squared_distances(mean[ends[:, 0]] - mean[ends[:, 1]], S)
     near = np.flatnonzero(d2 <= max(rules.gate, ALONE_GATE))
-    near = near[[not together(int(keys[a]), int(keys[b])) for a, b in ends[near].tolist()]]
-    near = near[np.argsort(d2[near], kind="stable")[:PAIRS_MAX]]
+    near = near[np.argsort(d2[near], kind="stable")]
+    apart_ones = (i for i, (a, b) in zip(near.tolist(), keys[ends[near]].tolist(), strict=True) if not together(a, b))
+    near = np.array(list(itertools.islice(apart_ones, PAIRS_MAX)), np.int64)
     ends, S, d2 = ends[near], S[near], d2[near]
     if not len(ends) or len(keys) < 3:  # with two landmarks nothing says how far the next may be
         return Duplicates([], 0.0)
