@@ -26,7 +26,8 @@ TRAVEL_LEAST: Final = 0.25
 
 class OwnMap:
     """See above. Frames are numbered from 0 on. aliases: pairs of landmarks that are one, the lesser number first.
-    misfit: chi-square per degree of freedom of all frames, each when `around` solved it last."""
+    misfit: chi-square per degree of freedom of all frames, each when `around` solved it last.
+    _fit (n, 3): of each frame then, chi-square, degrees of freedom and robust weight."""
 
     def __init__(self) -> None:
         self.frames: list[FrameDelta] = []
@@ -39,7 +40,7 @@ class OwnMap:
         self._start = np.zeros(3)
         self._views: list[View | None] = []
         self._landmarks, self._poses = np.empty((0, 2)), np.empty((0, 3))
-        self._fit = np.empty((0, 2))
+        self._fit = np.empty((0, 3))
         self._changed: set[int] = set()
 
     def put(self, frame: int, total: FrameDelta) -> None:
@@ -102,7 +103,8 @@ class OwnMap:
         views = [each or view(delta) for each, delta in zip(self._views, self.frames, strict=True)]
         self._views[:] = views
         at = starts(self._poses, views)
-        deltas, numbers = chain(self.frames, views, nearby(views, at, self._first, most, self._changed))
+        chosen = nearby(views, at, self._first, most, self._changed)
+        deltas, numbers = chain(self.frames, views, self._fit[:, 2], chosen)
         solution = self._solve(deltas, numbers, at[numbers[0]], ENOUGH)
         ends = np.append(numbers[1:], len(views))
         self._poses = carried(at, np.append(numbers[0], ends), np.vstack([at[numbers[0]], solution.pose_mean]))[1:]
@@ -125,9 +127,9 @@ class OwnMap:
         self._numbers, self._start = numbers, start
         self._landmarks = np.full((len(self._first), 2), np.nan)
         self._landmarks[[names[0].number for names in solution.classes]] = solution.landmark_mean
-        self._fit = np.concatenate([self._fit, np.zeros((len(self.frames) - len(self._fit), 2))])
+        self._fit = np.concatenate([self._fit, np.zeros((len(self.frames) - len(self._fit), 3))])
         whole = np.array([delta is self.frames[k] for delta, k in zip(deltas, numbers.tolist(), strict=True)])
-        self._fit[numbers[whole]] = np.column_stack([solution.chi_square, solution.dof])[whole]
+        self._fit[numbers[whole]] = np.column_stack([solution.chi_square, solution.dof, solution.weight])[whole]
         self._changed.clear()
         return solution
 
@@ -144,7 +146,7 @@ class OwnMap:
         self.aliases = [(a, b) for a, b in aliases]
         self._views, self._changed = [None] * len(frames), set(changed)
         self._landmarks, self._poses = np.frombuffer(landmarks).reshape(-1, 2), np.frombuffer(poses).reshape(-1, 3)
-        self._fit = np.frombuffer(fit).reshape(-1, 2)
+        self._fit = np.frombuffer(fit).reshape(-1, 3)
 
 
 def first_names(aliases: Sequence[tuple[int, int]], count: int) -> Ints:

@@ -3,8 +3,8 @@
 1. Up to WHOLE_FRAMES all do. Beyond, a window does: the RECENT newest, those that have changed since, and of each
    landmark that may be among the nearest the SEEN_IN newest that saw it.
 2. Frames between two of them that are left out become one, which says where the next one starts as seen from where the
-   first of them does: each frame's own word on its end, landmarks marginalised out, one after the other. What they know
-   together by landmarks they share is left out.
+   first of them does: each frame's own word on its end, landmarks marginalised out, one after the other, each with the
+   robust weight it had when it was solved last. What they know together by landmarks they share is left out.
 3. So the window's information is a part of all there is: with W of the window and M what the whole map says about the
    same variables, M - W is positive semidefinite, and no covariance is smaller than that of the whole map.
 4. Frames that are left out stay where they were, moved along with the ends of their gap. This only says which frames
@@ -78,9 +78,14 @@ def _chained(ends: Floats, covs: Floats) -> tuple[Floats, Floats]:
     return x, P
 
 
-def joined(views: Sequence[View]) -> FrameDelta:
-    """Frames one after the other as one that is about its last pose only (rule 2). Raises NumericalError."""
-    x, P = _chained(np.array([each.end for each in views]), np.array([each.end_cov for each in views]))
+def joined(views: Sequence[View], weights: Floats) -> FrameDelta:
+    """Frames one after the other as one that is about its last pose only (rule 2). Raises NumericalError.
+
+    Args:
+        weights (k,): by which each frame's information counts.
+    """
+    covs = np.array([each.end_cov for each in views]) / weights[:, None, None]
+    x, P = _chained(np.array([each.end for each in views]), covs)
     H = np.linalg.inv((P + P.T) / 2)
     H = (H + H.T) / 2
     return quantised(np.zeros(1, np.int64), H, H @ x, x)
@@ -119,13 +124,15 @@ def nearby(views: Sequence[View], at: Floats, first: Ints, most: int, changed: s
     return np.unique(np.concatenate([frame[order[turn < SEEN_IN]], recent, np.array(sorted(changed), np.int64)]))
 
 
-def chain(frames: Sequence[FrameDelta], views: Sequence[View], chosen: Ints) -> tuple[list[FrameDelta], Ints]:
+def chain(
+    frames: Sequence[FrameDelta], views: Sequence[View], weights: Floats, chosen: Ints
+) -> tuple[list[FrameDelta], Ints]:
     """The window as frames that follow each other, gaps joined; and the number of the frame that each starts with."""
     deltas, numbers = list[FrameDelta](), list[int]()
     for k in chosen.tolist():
         if numbers and numbers[-1] + 1 < k:
             numbers.append(numbers[-1] + 1)
-            deltas.append(joined(views[numbers[-1] : k]))
+            deltas.append(joined(views[numbers[-1] : k], weights[numbers[-1] : k]))
         numbers.append(k)
         deltas.append(frames[k])
     return deltas, np.array(numbers, np.int64)

@@ -44,7 +44,7 @@ def _tell_apart() -> None:
         framed.step(Reading(time_s=float(k), odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=seen))
     pairs = Candidates(np.zeros((1, 2)), np.eye(2), np.array([[0, 1]]), np.eye(2, dtype=bool), np.ones(1))
     grown(pairs, 0, 1.0)
-    joined([view(quantised(np.zeros(1, np.int64), np.eye(3), np.zeros(3), np.zeros(3)))] * 2)
+    joined([view(quantised(np.zeros(1, np.int64), np.eye(3), np.zeros(3), np.zeros(3)))] * 2, np.ones(2))
     mean, which = np.array([0.0, 0.0, 0.0, 1.0, 0.0]), np.zeros(1, np.int64)
     squared_distances_from(RANGE_BEARING, np.zeros(3), mean, np.eye(5), which, SEEN.z, SEEN.cov)
 

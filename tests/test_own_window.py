@@ -86,7 +86,7 @@ def test_a_window_does_not_grow_with_the_way_driven() -> None:
 def test_without_a_limit_it_is_the_whole_map_to_the_bit() -> None:
     own = filled(10)
     views = [view(delta) for delta in own.frames]
-    deltas, numbers = chain(own.frames, views, np.arange(10))
+    deltas, numbers = chain(own.frames, views, np.ones(10), np.arange(10))
     assert deltas == own.frames
     assert numbers.tolist() == list(range(10))
 
@@ -149,7 +149,8 @@ def test_of_each_landmark_around_the_newest_frames_that_saw_it_are_in_the_window
 
 def test_joined_frames_are_their_ends_one_after_the_other() -> None:
     views = [view(delta) for delta in driven().frames[:7]]
-    whole = joined(views)
+    weights = np.array([1.0, 1.0, 0.5, 1.0, 0.1, 1.0, 1.0])
+    whole = joined(views, weights)
 
     def end(ends: Floats) -> Floats:
         pose = ends[:3]
@@ -159,7 +160,8 @@ def test_joined_frames_are_their_ends_one_after_the_other() -> None:
 
     ends = np.concatenate([each.end for each in views])
     J = reference.numeric_jacobian(end, ends)
-    P = sum(J[:, 3 * k : 3 * k + 3] @ each.end_cov @ J[:, 3 * k : 3 * k + 3].T for k, each in enumerate(views))
+    parts = [J[:, 3 * k : 3 * k + 3] for k in range(len(views))]
+    P = sum(part @ each.end_cov @ part.T / w for part, each, w in zip(parts, views, weights.tolist(), strict=True))
     info = to_information(whole)
     assert whole.variables.tolist() == [0]
     np.testing.assert_allclose(np.linalg.inv(info.H.toarray()), P, rtol=1e-5, atol=1e-9)
