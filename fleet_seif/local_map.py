@@ -89,10 +89,30 @@ def _seen(spread: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
 
 
 @kernel
+def _rows(which: Ints) -> Ints:
+    """Rows of the pose and of these landmarks, shape (3 + 2 c,)."""
+    rows = np.arange(3 + 2 * len(which))
+    for i in range(len(which)):
+        rows[3 + 2 * i], rows[4 + 2 * i] = 3 + 2 * which[i], 4 + 2 * which[i]
+    return rows
+
+
+@kernel
+def _kept(mean: Floats, P: Floats, rows: Ints) -> tuple[Floats, Floats]:
+    part = np.empty((len(rows), len(rows)))
+    for i in range(len(rows)):
+        for j in range(len(rows)):
+            part[i, j] = P[rows[i], rows[j]]
+    return mean[rows], part
+
+
+@kernel
 def expected(model: int, mean: Floats, P: Floats, which: Ints) -> tuple[Floats, Floats]:
     """Sightings of these landmarks: expected h (c, 2), their joint covariance J P J' (2 c, 2 c) without noise."""
-    h, J_x, J_y = _blocks(model, mean, which)
-    return h, _seen(_spread(P, which, J_x, J_y), which, J_x, J_y)
+    mean, P = _kept(mean, P, _rows(which))
+    all_of_them = np.arange(len(which))
+    h, J_x, J_y = _blocks(model, mean, all_of_them)
+    return h, _seen(_spread(P, all_of_them, J_x, J_y), all_of_them, J_x, J_y)
 
 
 @kernel
@@ -283,19 +303,9 @@ def with_new(model: int, local: LocalMap, key: int, z: Floats, Z: Floats) -> Loc
     return LocalMap(mean, P, np.append(local.keys, key))
 
 
-@kernel
-def _kept(mean: Floats, P: Floats, rows: Ints) -> tuple[Floats, Floats]:
-    part = np.empty((len(rows), len(rows)))
-    for i in range(len(rows)):
-        for j in range(len(rows)):
-            part[i, j] = P[rows[i], rows[j]]
-    return mean[rows], part
-
-
 def kept(local: LocalMap, which: Ints) -> LocalMap:
     """Only these landmarks."""
-    rows = np.concatenate([np.arange(3), (3 + 2 * which[:, None] + np.arange(2)).ravel()])
-    return LocalMap(*_kept(local.mean, local.P, rows), local.keys[which])
+    return LocalMap(*_kept(local.mean, local.P, _rows(which)), local.keys[which])
 
 
 @kernel

@@ -20,6 +20,7 @@ from fleet_seif.joint_tree import LEAF_PIECES_MAX
 from fleet_seif.local_map import squared_distances_from
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello
 from fleet_seif.models import RANGE_BEARING
+from fleet_seif.own_window import joined, view
 from fleet_seif.records import Reading, Sightings
 from fleet_seif.seif import Seif
 from fleet_seif.wire import decode_message, encode_message
@@ -43,6 +44,7 @@ def _tell_apart() -> None:
         framed.step(Reading(time_s=float(k), odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=seen))
     pairs = Candidates(np.zeros((1, 2)), np.eye(2), np.array([[0, 1]]), np.eye(2, dtype=bool), np.ones(1))
     grown(pairs, 0, 1.0)
+    joined([view(quantised(np.zeros(1, np.int64), np.eye(3), np.zeros(3), np.zeros(3)))] * 2, np.ones(2))
     mean, which = np.array([0.0, 0.0, 0.0, 1.0, 0.0]), np.zeros(1, np.int64)
     squared_distances_from(RANGE_BEARING, np.zeros(3), mean, np.eye(5), which, SEEN.z, SEEN.cov)
 
