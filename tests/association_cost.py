@@ -47,7 +47,7 @@ def main() -> None:
     spent_us(200, FilterSettings(identities="associated"))  # compiles
     for landmarks in parser.parse_args().landmarks:
         known, _, _ = spent_us(landmarks, FilterSettings())
-        step, closing, framed = spent_us(landmarks, FilterSettings(identities="associated", close_lag_steps=12))
+        step, closing, framed = spent_us(landmarks, FilterSettings(identities="associated"))
         report = (
             f"{landmarks:6d} landmarks ({len(framed.signatures)} begun): step {step:6.0f} us, with identities"
             f" {known:6.0f} us, so {step - known:6.0f} us more; closing a frame {closing / 1e3:8.1f} ms"
