@@ -17,6 +17,8 @@ from fleet_seif.envelope import authenticate
 from fleet_seif.errors import RunError, WireError
 from fleet_seif.keys import Keys, node_of
 from fleet_seif.map_wire import decode_map, read_piece
+from fleet_seif.merge_records import MergeReport
+from fleet_seif.merge_wire import decode_merges
 from fleet_seif.messages import JointMap
 from fleet_seif.signing import KeyRing, Role
 
@@ -72,13 +74,17 @@ class FleetClient:
     def __init__(self, bus: ZenohBus, fleet: str, keys: KeyRing | None = None) -> None:
         self._loop = asyncio.get_running_loop()
         self._assembler = MapAssembler(keys)
+        self._keys = keys
         self._followed = ""
         self._heard_s = 0.0
         self._newest: JointMap | None = None
+        self._merges: dict[str, MergeReport] = {}
         self._nodes: set[str] = set()
         self._gone_at_s: float | None = None
         self._changed = asyncio.Event()
         names = Keys(fleet)
+        bus.subscribe(names.merges("*"), lambda _, data: self._hand_over(self._take_merges, data, False))
+        bus.ask(names.merges("*"), b"", lambda data: self._hand_over(self._take_merges, data, True), lambda: None)
         bus.subscribe(names.map("*"), lambda _, data: self._hand_over(self._take, data, False))
         bus.watch(names.node_alive("*"), lambda key, alive: self._hand_over(self._note_node, node_of(key), alive))
         bus.ask(names.map("*"), b"", lambda data: self._hand_over(self._take, data, True), lambda: None)
@@ -97,6 +103,19 @@ class FleetClient:
             self._newest = joint
             self._wake()
 
+    def _take_merges(self, data: bytes, whole: bool) -> None:
+        try:
+            report = decode_merges(data)
+            authenticate(data, self._keys, Role.NODE, report.node)
+        except WireError as error:
+            log.warning("merges_refused reason=%s", error)
+            return
+        known = self._merges.get(report.node)
+        room = known is not None or len(self._merges) < NODES_MAX
+        if room and (known is None or known.version <= report.version):
+            self._merges[report.node] = report
+            self._wake()
+
     def _follows(self, joint: JointMap) -> bool:
         now_s = self._loop.time()
         if joint.node != self._followed and self._followed in self._nodes and now_s < self._heard_s + GONE_S:
@@ -113,6 +132,14 @@ class FleetClient:
         """Wake everybody who waits now; who waits later waits for the next change."""
         self._changed.set()
         self._changed = asyncio.Event()
+
+    async def merges(self, node: str, wait_s: float = 0.0) -> MergeReport | None:
+        """What a node has said last of the merges in its maps; None where nothing comes within wait_s."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(wait_s):
+                while node not in self._merges:
+                    await self._changed.wait()
+        return self._merges.get(node)
 
     async def maps(self) -> AsyncIterator[JointMap]:
         """The current map, then the newest one whenever there is one; maps in between are skipped.

@@ -1,6 +1,6 @@
 """Settings shared by every process: frozen, keyword-only, unknown keys refused, units last in names."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -57,6 +57,14 @@ class AssociationSettings(Settings):
     local_landmarks_max: Annotated[int, Field(ge=10, le=1000)] = 150
 
 
+def _close_lag_steps(given: dict[str, Any]) -> int:
+    """The default of FilterSettings.close_lag_steps, from the fields before it."""
+    if given["identities"] == "signatures":
+        return 2
+    association: AssociationSettings = given["association"]
+    return association.confirm_steps + association.confirm_steps // 2
+
+
 class FilterSettings(Settings):
     """The filter of one vehicle.
 
@@ -77,7 +85,9 @@ class FilterSettings(Settings):
     deviation of frame_heading_std_max_rad.
     frame_huber: standard deviations up to which a sighting counts in full when a frame is closed (Huber's k): for
     sensors whose errors have heavy tails; none: all that pass the gate do.
-    close_lag_steps: steps after which the correction of a closed frame is published.
+    close_lag_steps: steps after which the correction of a closed frame is published; 2 by default. With identities =
+    "associated" it is one and a half times association.confirm_steps, so that what was seen in the frame of landmarks
+    that are confirmed only after it enters its first correction (steps out of their reach do not count as confirming).
     localise_steps: steps after which a vehicle of several frames solves them as one system, for its live pose and
     map; in between the open frame's filter goes on alone. Enters nothing that is published.
     identities: "signatures", each sighting says which landmark it is; "associated", the vehicle finds out by where
@@ -101,10 +111,10 @@ class FilterSettings(Settings):
     frame_landmarks_max: Annotated[int, Field(ge=2, le=1000)] = 60
     frame_heading_std_max_rad: Positive = 0.5
     frame_huber: Positive | None = None
-    close_lag_steps: Annotated[int, Field(ge=1, le=10_000)] = 2
     localise_steps: Annotated[int, Field(ge=1, le=10_000)] = 5
     identities: Literal["signatures", "associated"] = "signatures"
     association: AssociationSettings = AssociationSettings()
+    close_lag_steps: int = Field(default_factory=_close_lag_steps, ge=1, le=10_000)
     landmarks_max: Annotated[int, Field(ge=1, le=10_000_000)] = 32_767
     neighbours_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
 

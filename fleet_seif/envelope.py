@@ -45,6 +45,7 @@ KIND_MAP: Final = 7
 KIND_EVENT: Final = 8
 KIND_STATUS: Final = 9
 KIND_EVIDENCE: Final = 10
+KIND_MERGES: Final = 11
 
 
 def seal(kind: int, fields: object, signer: Signer | None = None) -> bytes:

@@ -54,6 +54,10 @@ class Keys:
         """A node's maps are put here in pieces, and queried whole; `*` for all nodes."""
         return f"{self._stem}/node/{node}/map"
 
+    def merges(self, node: str) -> str:
+        """What a node says of its merges is put here, and queried; `*` for all nodes."""
+        return f"{self._stem}/node/{node}/merges"
+
 
 def vehicle_of(key: str) -> str:
     """The vehicle in a key that names one, "" otherwise."""

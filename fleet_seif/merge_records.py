@@ -1,12 +1,19 @@
 """What is said about merges: the rules, what became of each pair and why, and the outcome."""
 
+import math
+from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from fleet_seif.joint import Pair
 from fleet_seif.joint_records import Classes
 from fleet_seif.messages import LandmarkName
+
+NEAREST_MAX: Final = 8
+"""Pairs kept apart for one reason that a report names."""
+DIFFERING_MAX: Final = 32
+"""Landmarks that another node has merged otherwise, in a report."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,3 +73,56 @@ class Merges:
     def refused(self) -> tuple[Considered, ...]:
         """Pairs that lie within the gate of each other and were not merged."""
         return tuple(each for each in self.considered if each.reason is not Reason.MERGED)
+
+
+class KeptApart(NamedTuple):
+    """A pair of landmarks that was not merged, and why. d2: its squared distance, None where it has no solution."""
+
+    a: LandmarkName
+    b: LandmarkName
+    reason: Reason
+    d2: float | None
+
+
+class Differing(NamedTuple):
+    """A landmark of a node that another one, with the same ledger, has merged otherwise: all those there that have one
+    of its names."""
+
+    node: str
+    ours: tuple[LandmarkName, ...]
+    theirs: Classes
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergeReport:
+    """What a fusion node says of the merges in a map of its: bounded, whatever the size of the map.
+
+    version, canonical, map_digest, ledger_digest: those of the map. kept_apart: how many pairs that came near each
+    other were not merged, by reason. nearest: at most NEAREST_MAX of them for each reason, of least squared distance.
+    differing: at most DIFFERING_MAX landmarks that other nodes with an equal ledger have merged otherwise.
+    """
+
+    fleet: str
+    node: str
+    version: int
+    canonical: bool
+    map_digest: bytes
+    ledger_digest: bytes
+    kept_apart: tuple[tuple[Reason, int], ...]
+    nearest: tuple[KeptApart, ...]
+    differing: tuple[Differing, ...] = ()
+
+
+def kept_apart(merges: Merges) -> tuple[tuple[Reason, int], ...]:
+    """How many pairs were kept apart for each reason, in the order of reasons."""
+    counts = Counter(each.reason for each in merges.refused)
+    return tuple((reason, counts[reason]) for reason in Reason if counts[reason])
+
+
+def nearest_apart(merges: Merges) -> tuple[KeptApart, ...]:
+    """The NEAREST_MAX pairs of least squared distance that were kept apart for each reason."""
+    found: list[KeptApart] = []
+    for reason, _ in kept_apart(merges):
+        mine = sorted((each.d2, each.a, each.b) for each in merges.refused if each.reason is reason)
+        found += (KeptApart(a, b, reason, d2 if math.isfinite(d2) else None) for d2, a, b in mine[:NEAREST_MAX])
+    return tuple(found)

@@ -7,6 +7,7 @@
    turn. One query a stream at a time, `queries_max` a vehicle; a query counts as lost after `QUERY_LOST_S`.
 4. Acknowledgements go out every `ack_every` messages or `ack_s`, and again with every heartbeat.
 5. Nodes tell each other how far they are every `status_s`; evidence and decisions of operators are fetched if unknown.
+   So is another node's map that differs though the ledgers are equal (fusion.comparison).
 6. Times are this node's own monotonic clock; nothing compares them with another's.
 """
 
@@ -19,11 +20,24 @@ from dataclasses import dataclass, field
 from fleet_seif.config import FusionSettings
 from fleet_seif.envelope import KIND_EVENT, KIND_HEARTBEAT, SEQUENCE_MAX, authenticate, kind_of
 from fleet_seif.errors import WireError
-from fleet_seif.messages import Ack, Epoch, NodeStatus, OperatorEvent, RangeRequest, StreamPosition, VehicleState
+from fleet_seif.map_wire import decode_map
+from fleet_seif.merge_records import Merges
+from fleet_seif.merge_wire import decode_merges, encode_merges
+from fleet_seif.messages import (
+    Ack,
+    Epoch,
+    JointMap,
+    NodeStatus,
+    OperatorEvent,
+    RangeRequest,
+    StreamPosition,
+    VehicleState,
+)
 from fleet_seif.node_wire import decode_event, decode_status, encode_status
 from fleet_seif.signing import KeyRing, Role, Signer
 from fleet_seif.wire import decode_heartbeat, decode_range, encode_ack, encode_range
 from fusion.compaction import compact
+from fusion.comparison import Comparison
 from fusion.ledger import Ledger, Receipt
 from fusion.stream import Stream
 
@@ -32,6 +46,8 @@ QUERY_LOST_S = 4.0
 REPLY_BYTES_MAX = 4 * 2**20
 ANNOUNCED_MAX = 8
 NODES_MAX = 100
+NODES_DIFFERING, CLASSES_DIFFERING = "nodes_merging_otherwise", "landmarks_merged_otherwise"
+"""Counters that go down again: how many other nodes have another map of the same ledger, and in how many landmarks."""
 TAKEN, REFUSED = "+", "-"
 """How the answer to an operator's decision begins."""
 
@@ -69,7 +85,21 @@ class AskEvents:
     node: str
 
 
-Effect = PutAck | AskRange | PutStatus | AskEvents
+@dataclass(frozen=True)
+class PutMerges:
+    """Tell subscribers and the other nodes about the merges in this one's newest map."""
+
+    data: bytes
+
+
+@dataclass(frozen=True)
+class AskMap:
+    """Query another node's map; the reply goes to `on_map`."""
+
+    node: str
+
+
+Effect = PutAck | AskRange | PutStatus | AskEvents | PutMerges | AskMap
 
 
 @dataclass
@@ -131,6 +161,7 @@ class FusionCore:
         self._expected = expected
         self._links: dict[tuple[str, Epoch], Link] = {}
         self._peers: dict[str, Peer] = {}
+        self._comparison = Comparison()
         self._status_due_s = 0.0
         self._compact_at = settings.compact_bytes
 
@@ -239,6 +270,54 @@ class FusionCore:
             if position.last == stream.next - 1 and position.prefix_digest != stream.prefix_digest:
                 effects.append(self._compare(stream, link))
         return [*effects, AskEvents(node)] if ask else effects
+
+    def on_merges(self, node: str, data: bytes) -> list[Effect]:
+        """What another node says of its merges."""
+        if node == self.node:
+            return []
+        try:
+            authenticate(data, self._keys, Role.NODE, node)
+            report = decode_merges(data)
+            if (report.fleet, report.node) != (self.ledger.fleet, node):
+                raise WireError(f"merges of {report.node!r} of {report.fleet!r} under the key of {node!r}")
+        except WireError as error:
+            return self._malformed(node, error)
+        ask = self._comparison.hear(report)
+        self._count_differing()
+        return [AskMap(node)] if ask else []
+
+    def on_map(self, node: str, data: bytes) -> list[Effect]:
+        """The map of another node, which has differed from this one's."""
+        try:
+            authenticate(data, self._keys, Role.NODE, node)
+            joint = decode_map(data)
+            if (joint.fleet, joint.node) != (self.ledger.fleet, node):
+                raise WireError(f"map of {joint.node!r} of {joint.fleet!r} under the key of {node!r}")
+        except WireError as error:
+            return self._malformed(node, error)
+        if self._comparison.learn(joint):
+            self._count("forks", node, "its ledger is equal and so are its landmarks, but not its totals")
+        self._count_differing()
+        return []
+
+    def on_served(self, joint: JointMap, merges: Merges) -> list[Effect]:
+        """This node's newest map, and the merges in it."""
+        self._comparison.serve(joint, merges)
+        self._count_differing()
+        return self._tell_merges()
+
+    def _tell_merges(self) -> list[Effect]:
+        report = self._comparison.report()
+        return [] if report is None else [PutMerges(encode_merges(report, self._signer))]
+
+    def _count_differing(self) -> None:
+        found = {NODES_DIFFERING: self._comparison.nodes, CLASSES_DIFFERING: self._comparison.landmarks}
+        for name, count in found.items():
+            if count != self.counters[name]:
+                log.info("%s count=%d", name, count)
+            self.counters[name] = count
+            if not count:
+                del self.counters[name]
 
     def _compare(self, stream: Stream, link: Link) -> AskRange:
         """Two nodes hold different messages for the same numbers: fetch what the others hold, a part at a time. Where
@@ -350,6 +429,7 @@ class FusionCore:
         if now_s >= self._status_due_s:
             self._status_due_s = now_s + self._settings.status_s
             effects.append(PutStatus(encode_status(self.status(), self._signer)))
+            effects += self._tell_merges()
         if self.ledger.bytes_held > self._compact_at:
             self.compact()
         return effects

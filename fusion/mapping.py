@@ -125,6 +125,11 @@ class MapMaker:
             taken = dataclasses.replace(taken, counters={**taken.counters, LEFT_OUT: len(taken.checked) - len(good)})
             return self._solved(taken, good, _classes_of(good, classes), version, final=final, canonical=canonical)
 
+    @property
+    def merges(self) -> Merges:
+        """Those that the last map was made with."""
+        return self._merges
+
     def _with_merges(self, lives: tuple[Life, ...], decisions: Decisions) -> Classes:
         """The classes of lives with the merges that were found last: all of them, where they were found for these."""
         return landmark_classes(lives, decisions.forced, decisions.forbidden, self._merges.pairs)

@@ -26,7 +26,7 @@ from fleet_seif.messages import Epoch, JointMap
 from fleet_seif.signing import Signer
 from fleet_seif.store import Change, Put, Store, StoreError
 from fusion import records
-from fusion.core import AskEvents, AskRange, Effect, FusionCore, PutAck, PutStatus
+from fusion.core import AskEvents, AskMap, AskRange, Effect, FusionCore, PutAck, PutMerges, PutStatus
 from fusion.inbox import Inbox
 from fusion.mapping import OF_MAPS, MapMaker, empty_map, map_input
 
@@ -112,7 +112,7 @@ class FusionService:
         self._over = threading.Event()
         self._alive: set[str] = set()
         self._changed_at_s: float | None = None
-        self._served = b""
+        self._served = self._told = b""
         self._maker = MapMaker()
         self._replayed = False
         self.newest: JointMap = empty_map(core.ledger.fleet, core.node, first_version - 1)
@@ -121,11 +121,13 @@ class FusionService:
         bus.subscribe(keys.deltas("*"), self._post(self._core.on_delta, vehicle_of))
         bus.subscribe(keys.heartbeats("*"), self._post(self._core.on_heartbeat, vehicle_of))
         bus.subscribe(keys.status("*"), self._post(self._core.on_status, node_of))
+        bus.subscribe(keys.merges("*"), self._post(lambda node, data, _: self._core.on_merges(node, data), node_of))
         bus.watch(keys.alive("*"), self._on_alive)
         bus.answer(keys.ledger("*"), self._on_range)
         bus.answer(keys.events(core.node), self._on_events_asked)
         bus.answer(keys.decisions(core.node), self._on_decision)
         self._maps.answer(keys.map(core.node), lambda key, data: [self._served] if self._served else [])
+        self._maps.answer(keys.merges(core.node), lambda key, data: [self._told] if self._told else [])
         self._maps.announce(keys.node_alive(core.node))
 
     def _post(self, handle: Callable[[str, bytes, float], list[Effect]], name_of: Callable[[str], str]) -> OnPut:
@@ -242,6 +244,12 @@ class FusionService:
                     lambda reply: replies("", reply),
                     lambda: self._done(vehicle, epoch),
                 )
+            case PutMerges(data=data):
+                self._told = data
+                self._maps.put(keys.merges(core.node), data, "control")
+            case AskMap(node=node):
+                maps = self._post(lambda who, reply, _: core.on_map(who, reply), lambda _: node)
+                self._bus.ask(keys.map(node), b"", lambda reply: maps("", reply), lambda: None)
             case AskEvents(node=node):
                 events = self._post(lambda who, reply, _: core.on_events(who, reply), lambda _: node)
                 self._bus.ask(keys.events(node), b"", lambda reply: events("", reply), lambda: None)
@@ -299,7 +307,12 @@ class FusionService:
             self.statistics.behind_s.append(self._clock() - changed_at_s)
 
     def _publish_map(self, newest: JointMap) -> None:
+        """What is to be said of its merges first: who has the map has that too."""
         self.newest = newest
+        with self._lock:
+            effects = self._core.on_served(newest, self._maker.merges)
+        for effect in effects:
+            self._execute(effect)
         self._served = encode_map(newest, self._signer)
         self._publish()
         self.statistics.maps += 1

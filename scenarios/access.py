@@ -48,20 +48,20 @@ class Access(NamedTuple):
 def access_of(fleet: str, member: Member) -> Access:
     """What a member that is no node may do."""
     keys, name = Keys(fleet), member.name
-    maps, nodes, vehicles = keys.map("*"), keys.node_alive("*"), keys.alive("*")
+    maps, nodes, vehicles = (keys.map("*"), keys.merges("*")), keys.node_alive("*"), keys.alive("*")
     if member.kind is Kind.VEHICLE:
         return Access(
             puts=(keys.deltas(name), keys.heartbeats(name)),
             answers=(keys.outbox(name),),
             announces=(keys.alive(name),),
-            subscribes=(keys.acks(name), maps),
-            asks=(maps,),
+            subscribes=(keys.acks(name), *maps),
+            asks=maps,
             watches=(nodes,),
         )
     if member.kind is Kind.OPERATOR:
-        asks = (maps, keys.events("*"), keys.decisions("*"))
-        return Access(subscribes=(maps, keys.status("*")), asks=asks, watches=(nodes, vehicles))
-    return Access(subscribes=(maps,), asks=(maps,), watches=(nodes, vehicles))
+        asks = (*maps, keys.events("*"), keys.decisions("*"))
+        return Access(subscribes=(*maps, keys.status("*")), asks=asks, watches=(nodes, vehicles))
+    return Access(subscribes=maps, asks=maps, watches=(nodes, vehicles))
 
 
 def access_control(fleet: str, members: Sequence[Member]) -> dict[str, Any]:

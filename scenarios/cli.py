@@ -5,7 +5,7 @@ import contextlib
 import json
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -285,44 +285,33 @@ LandmarkArgument = Annotated[
 ]
 
 
-@app.command()
-@_clear_errors()
-def merge(
-    one: LandmarkArgument,
-    other: LandmarkArgument,
-    undo: Annotated[bool, typer.Option("--undo", help="Leave it to what is seen again.")] = False,
-    connect: ConnectOption = None,
-    fleet: NamedFleetOption = "fleet",
-    operator: OperatorOption = "operator",
-    store: DownOption = None,
-    config: ConfigOption = None,
-    insecure: InsecureOption = False,
-    signing_key: SigningKeyOption = None,
-) -> None:
-    """Decide that two landmarks are one. Lasts until it is undone, on every node."""
-    action = Action.RELEASE if undo else Action.FORCE
-    desk = _desk(connect, fleet, operator, store, config, insecure, signing_key)
-    decisions.decide(desk, decisions.about_landmarks(action, one, other), console)
+def _about_landmarks(decided: Action) -> Callable[..., None]:
+    """A command that decides about two landmarks, and can undo that."""
+
+    @_clear_errors()
+    def command(
+        one: LandmarkArgument,
+        other: LandmarkArgument,
+        undo: Annotated[bool, typer.Option("--undo", help="Leave it to what is seen again.")] = False,
+        connect: ConnectOption = None,
+        fleet: NamedFleetOption = "fleet",
+        operator: OperatorOption = "operator",
+        store: DownOption = None,
+        config: ConfigOption = None,
+        insecure: InsecureOption = False,
+        signing_key: SigningKeyOption = None,
+    ) -> None:
+        action = Action.RELEASE if undo else decided
+        desk = _desk(connect, fleet, operator, store, config, insecure, signing_key)
+        decisions.decide(desk, decisions.about_landmarks(action, one, other), console)
+
+    return command
 
 
-@app.command()
-@_clear_errors()
-def split(
-    one: LandmarkArgument,
-    other: LandmarkArgument,
-    undo: Annotated[bool, typer.Option("--undo", help="Leave it to what is seen again.")] = False,
-    connect: ConnectOption = None,
-    fleet: NamedFleetOption = "fleet",
-    operator: OperatorOption = "operator",
-    store: DownOption = None,
-    config: ConfigOption = None,
-    insecure: InsecureOption = False,
-    signing_key: SigningKeyOption = None,
-) -> None:
-    """Decide that two landmarks are two. Lasts until it is undone, on every node."""
-    action = Action.RELEASE if undo else Action.FORBID
-    desk = _desk(connect, fleet, operator, store, config, insecure, signing_key)
-    decisions.decide(desk, decisions.about_landmarks(action, one, other), console)
+MERGE_HELP = "Decide that two landmarks are one. Lasts until it is undone, on every node."
+SPLIT_HELP = "Decide that two landmarks are two. Lasts until it is undone, on every node."
+app.command("merge", help=MERGE_HELP)(_about_landmarks(Action.FORCE))
+app.command("split", help=SPLIT_HELP)(_about_landmarks(Action.FORBID))
 
 
 @app.command()

@@ -137,7 +137,8 @@ def _override(tables: dict[str, Any], override: str) -> None:
 
 def _explain(source: str, error: ValidationError) -> str:
     lines = []
-    for fault in error.errors():
+    told = [fault for fault in error.errors() if fault["type"] != "default_factory_not_called"]  # follows from another
+    for fault in told:
         where = ".".join(str(part) for part in fault["loc"])
         text = fault["msg"].removeprefix("Value error, ")
         if fault["type"] == "extra_forbidden":

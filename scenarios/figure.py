@@ -23,9 +23,12 @@ from matplotlib.transforms import Affine2D
 
 from fleet_seif.records import Floats
 from scenarios.association import Truths
+from scenarios.figure_marks import DASHED, draw_kept_apart, draw_own_map, draw_seen_by, legend_of, seen_by_several
 from scenarios.history import Moment, meetings
+from scenarios.palette import FAINT, FEW_COLOURS, GREY, INK, LARGE, PLAIN, SMALL
 from scenarios.recording import Log, Recording
 from scenarios.score import align, landmark_truths, rmse
+from vehicles.drive import DriveResult
 
 Kind = Literal["meetings", "overview"]
 
@@ -46,9 +49,12 @@ CROWDED_STEPS: Final = 3000
 """Tracks of more steps in all are drawn thinner."""
 PATH_POINTS_MAX: Final = 4000
 LEGEND_VEHICLES_MAX: Final = 20
-FEW_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-INK, SHARED, GREY, FAINT, ALIGNED = "#222222", "#111111", "#8a8a8a", "#dddddd", "#a8780a"
-SMALL, PLAIN, LARGE = 10.0, 11.5, 15.0
+SHARED, ALIGNED = "#111111", "#a8780a"
+STRIPS_Y: Final = {1: (0.028,), 2: (0.047, 0.018), 3: (0.062, 0.037, 0.012)}
+"""Heights of the legend's strips, by how many there are."""
+STRIP_CHARACTERS: Final = 225
+"""What fits into a strip of the legend, with HANDLE_CHARACTERS for each mark; longer ones are written smaller."""
+HANDLE_CHARACTERS: Final = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +78,7 @@ class _Scene:
     recording: Recording
     moments: Sequence[Moment]
     times: FigureTimes
-    tracks: Mapping[str, Floats]
+    drives: Mapping[str, DriveResult]
     colours: dict[str, Any]
     truths: Truths
 
@@ -119,7 +125,7 @@ def draw_figure(
     recording: Recording,
     times: FigureTimes,
     moments: Sequence[Moment],
-    tracks: Mapping[str, Floats],
+    drives: Mapping[str, DriveResult],
     truths: Truths,
 ) -> None:
     """Write the figure as a PNG of SIZE_IN by DPI pixels.
@@ -127,10 +133,10 @@ def draw_figure(
     Args:
         times: as `figure_times` gave them; its kind decides the layout.
         moments: the joint map at those times, as `history.replay` gave them; some or all may be missing.
-        tracks: each vehicle's live estimate (T+1, 3), pose k at its log's time k; vehicles may be missing.
+        drives: what each vehicle had to say, pose k at its log's time k; vehicles may be missing.
         truths: which true landmark each vehicle's landmarks are.
     """
-    scene = _Scene(recording, moments, times, tracks, _colours(list(recording.logs)), truths)
+    scene = _Scene(recording, moments, times, drives, _colours(list(recording.logs)), truths)
     figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     figure.text(0.04, 0.968, title, fontsize=LARGE, color=INK, weight="bold", va="center")
@@ -174,15 +180,22 @@ def _draw_map(axes: Axes, scene: _Scene, until_s: float, limits: Floats, size: f
     axes.set_xlim(*limits[0])
     axes.set_ylim(*limits[1])
     axes.plot(truth[:, 0], truth[:, 1], "x", color=GREY, ms=4.5 * crowd, mew=0.9, zorder=4)
+    moment = _moment_at(scene, until_s)
     for name, log in logs.items():
         colour, count = scene.colours[name], int(np.searchsorted(log.time_s, until_s, side="right"))
         _draw_path(axes, log.truth_pose[:count], color=colour, lw=0.6 * width, alpha=0.4, zorder=1)
-        track = scene.tracks.get(name, np.empty((0, 3)))[:count]
+        track = scene.drives[name].pose[:count] if name in scene.drives else np.empty((0, 3))
         tail = track[-TAIL_STEPS:] if scene.times.kind == "meetings" else track
-        _draw_path(axes, tail, color=colour, lw=width, alpha=0.75, zorder=3)
-    moment = _moment_at(scene, until_s)
+        is_fused = moment is None or name not in moment.doubtful
+        _draw_path(axes, tail, color=colour, lw=width, alpha=0.75, zorder=3, ls="-" if is_fused else DASHED)
+        if not is_fused and len(track):
+            _draw_vehicle(axes, track[-1], size, mfc="white", mec=colour)
+            if until_s >= scene.times.times_s[-1]:  # how its own map was before, nobody has kept
+                draw_own_map(axes, scene.drives[name].landmarks, colour, size)
     if moment is not None:
         _draw_landmarks(axes, scene, moment, crowd)
+        landmarks = moment.solution.landmark_mean, moment.solution.classes
+        draw_kept_apart(axes, *landmarks, moment.merges.refused, math.sqrt(size))
         _draw_vehicles(axes, scene, moment, size)
     _plain(axes)
 
@@ -195,8 +208,9 @@ def _draw_path(axes: Axes, poses: Floats, **style: Any) -> None:
 
 
 def _draw_landmarks(axes: Axes, scene: _Scene, moment: Moment, crowd: float) -> None:
-    """Means and ellipses of SIGMAS standard deviations, in the colour of who saw them."""
-    colours = [_seen_by(scene, {name.vehicle for name in names}) for names in moment.solution.classes]
+    """Means and ellipses of SIGMAS standard deviations, in the colours of who saw them."""
+    vehicles = [sorted({name.vehicle for name in names}) for names in moment.solution.classes]
+    colours = [scene.colours.get(each[0], SHARED) if len(each) == 1 else SHARED for each in vehicles]
     variance, axis = np.linalg.eigh(moment.landmark_cov)
     across = 2 * SIGMAS * np.sqrt(np.maximum(variance, 0.0))
     angle_deg = np.degrees(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
@@ -209,20 +223,21 @@ def _draw_landmarks(axes: Axes, scene: _Scene, moment: Moment, crowd: float) -> 
                 linewidths=1.0, zorder=4, **style,
             )
         )  # fmt: skip
-    axes.scatter(mean[:, 0], mean[:, 1], s=7.0 * crowd**2, c=colours, linewidths=0, zorder=5)
+    draw_seen_by(axes, mean, vehicles, scene.colours, 7.0 * crowd**2)
 
 
 def _draw_vehicles(axes: Axes, scene: _Scene, moment: Moment, size: float) -> None:
     """A triangle at each vehicle's newest pose in the joint map, pointing ahead."""
     poses = moment.solution.pose_mean
     newest = {vehicle: poses[i] for i, (vehicle, _, k) in enumerate(moment.solution.poses) if k < 0}
-    for vehicle, (x, y, theta) in newest.items():
-        ahead = Affine2D().scale(0.75, 1.25).rotate(theta - math.pi / 2)
-        marker = MarkerStyle("^", transform=ahead)
-        axes.plot(
-            [x], [y], linestyle="none", marker=marker, ms=10.0 * math.sqrt(size), mfc=scene.colours[vehicle],
-            mec="white", mew=1.0, zorder=7,
-        )  # fmt: skip
+    for vehicle, pose in newest.items():
+        _draw_vehicle(axes, pose, size, mfc=scene.colours[vehicle], mec="white")
+
+
+def _draw_vehicle(axes: Axes, pose: Floats, size: float, **style: Any) -> None:
+    x, y, theta = pose
+    marker = MarkerStyle("^", transform=Affine2D().scale(0.75, 1.25).rotate(theta - math.pi / 2))
+    axes.plot([x], [y], linestyle="none", marker=marker, ms=10.0 * math.sqrt(size), mew=1.0, zorder=7, **style)
 
 
 def _draw_curves(figure: Figure, scene: _Scene, left: float) -> None:
@@ -274,12 +289,12 @@ def _mark_meetings(above: Axes, below: Axes, scene: _Scene) -> None:
 
 
 def _draw_legend(figure: Figure, scene: _Scene) -> None:
-    """One strip along the foot of the figure: first the marks, then the vehicles."""
+    """Strips along the foot of the figure: the marks, the vehicles, and what was not merged or not fused."""
     tail = f", last {TAIL_STEPS} steps" if scene.times.kind == "meetings" else ""
     marks = [
         Line2D([], [], label="true landmark", marker="x", color=GREY, ls="none", ms=6),
         Line2D([], [], label=f"estimate with {SIGMAS:.0f}σ ellipse", marker="o", ls="none", ms=10, mfc=FAINT, mec=GREY),
-        Line2D([], [], label="black: seen by several vehicles", marker="o", ls="none", ms=6, color=SHARED),
+        seen_by_several(list(scene.colours.values())),
         Line2D([], [], label="true track", color=GREY, lw=0.7),
         Line2D([], [], label=f"live estimate{tail}", color=GREY, lw=2.0),
     ]
@@ -288,11 +303,15 @@ def _draw_legend(figure: Figure, scene: _Scene) -> None:
         for name, colour in list(scene.colours.items())[:LEGEND_VEHICLES_MAX]
     ]
     few = len(vehicles) <= len(FEW_COLOURS)
-    for handles, y in ((marks + vehicles, 0.028),) if few else ((marks, 0.047), (vehicles, 0.018)):
+    shown = [m for time_s, _ in scene.times.panels if (m := _moment_at(scene, time_s)) is not None]
+    apart = legend_of([m.merges.refused for m in shown], sorted(frozenset().union(*(m.doubtful for m in shown))))
+    strips = [strip for strip in ([marks + vehicles] if few else [marks, vehicles]) + [apart] if strip]
+    for handles, y in zip(strips, STRIPS_Y[len(strips)], strict=True):
+        length = sum(len(str(handle.get_label())) + HANDLE_CHARACTERS for handle in handles)
         figure.legend(
             handles=handles, loc="center", bbox_to_anchor=(0.5, y), ncols=len(handles), frameon=False, labelcolor=INK,
-            fontsize=SMALL, borderaxespad=0.0, columnspacing=1.6 if few else 1.0, handletextpad=0.5,
-            handlelength=1.8,
+            fontsize=SMALL * min(1.0, STRIP_CHARACTERS / length), borderaxespad=0.0, handletextpad=0.5,
+            columnspacing=1.6 if few else 1.0, handlelength=1.8,
         )  # fmt: skip
 
 
@@ -312,10 +331,6 @@ def _step(scene: _Scene, time_s: float) -> int:
     """Index of the pose at a time, in the longest log."""
     longest: Log = max(scene.recording.logs.values(), key=lambda log: log.steps)
     return int(np.searchsorted(longest.time_s, time_s))
-
-
-def _seen_by(scene: _Scene, vehicles: set[str]) -> Any:
-    return scene.colours.get(next(iter(vehicles)), SHARED) if len(vehicles) == 1 else SHARED
 
 
 def _colours(vehicles: Sequence[str]) -> dict[str, Any]:
@@ -345,7 +360,7 @@ def _limits(scene: _Scene, ratio: float) -> Floats:
     recording = scene.recording
     points = [recording.landmarks, *(log.truth_pose[:, :2] for log in recording.logs.values())]
     if not any(np.isfinite(p).all(axis=1).any() for p in points):
-        points = [m.solution.landmark_mean for m in scene.moments[-1:]] + [t[:, :2] for t in scene.tracks.values()]
+        points = [m.solution.landmark_mean for m in scene.moments[-1:]] + [d.pose[:, :2] for d in scene.drives.values()]
     found = np.concatenate([*points, np.empty((0, 2))])
     found = found[np.isfinite(found).all(axis=1)]
     low, high = (found.min(axis=0), found.max(axis=0)) if len(found) else (np.zeros(2), np.ones(2))

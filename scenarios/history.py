@@ -8,6 +8,7 @@ import numpy as np
 from fleet_seif.envelope import KIND_SNAPSHOT, kind_of
 from fleet_seif.errors import NumericalError
 from fleet_seif.joint import JointSolution, JointSolver, marginal_covariances
+from fleet_seif.merging import Merges
 from fleet_seif.messages import FrameStatus
 from fleet_seif.records import Floats
 from fleet_seif.wire import decode_message
@@ -18,11 +19,17 @@ from scenarios.recording import Log, Recording
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Moment:
-    """The joint map at one time, s. landmark_cov (n, 2, 2) m^2."""
+    """The joint map at one time, s.
+
+    landmark_cov (n, 2, 2) m^2. merges: what became of each pair of landmarks. doubtful: vehicles that say so of
+    themselves, and are not fused.
+    """
 
     time_s: float
     solution: JointSolution
     landmark_cov: Floats
+    merges: Merges
+    doubtful: frozenset[str]
 
     @property
     def uncertainty_m2(self) -> float:
@@ -56,14 +63,21 @@ def replay(ledger: Ledger, times_s: Sequence[float]) -> Iterable[Moment]:
             again.accept(waiting[at][2])
             at += 1
         lives = again.lives(live=True)
-        classes = merger.of(lives, again.decisions).classes
-        if not classes:
+        merges = merger.of(lives, again.decisions)
+        if not merges.classes:
             continue
         try:
-            solution = solver.update(lives, classes)
+            solution = solver.update(lives, merges.classes)
         except NumericalError:
             continue
-        yield Moment(time_s=time_s, solution=solution, landmark_cov=marginal_covariances(solution)[0])
+        doubtful = {s.vehicle for s in again.streams.values() if not s.healthy} - {life.vehicle for life in lives}
+        yield Moment(
+            time_s=time_s,
+            solution=solution,
+            landmark_cov=marginal_covariances(solution)[0],
+            merges=merges,
+            doubtful=frozenset(doubtful),
+        )
 
 
 def pose_times(ledger: Ledger, poses: Sequence[tuple[str, int, int]]) -> Floats:

@@ -152,7 +152,7 @@ def write_folder(folder: Path, run: FinishedRun, outcome: Outcome) -> None:
         times=times,
         recording=run.recording,
         moments=list(replay(run.ledger, times.times_s)),
-        tracks={name: drive.pose for name, drive in run.drives.items()},
+        drives=run.drives,
         truths=run.truths,
     )
     output.write_json(folder / "report.json", outcome.report)  # last: who finds it finds the rest

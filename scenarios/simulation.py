@@ -18,9 +18,11 @@ import numpy as np
 
 from fleet_seif.errors import NumericalError, ReadingRefused
 from fleet_seif.link import LinkModel, LinkSettings
-from fleet_seif.messages import Epoch
+from fleet_seif.map_wire import encode_map
+from fleet_seif.merge_records import Merges
+from fleet_seif.messages import Epoch, JointMap
 from fleet_seif.store import MemoryStore
-from fusion.core import AskEvents, AskRange, Effect, FusionCore, PutAck, PutStatus
+from fusion.core import AskEvents, AskMap, AskRange, Effect, FusionCore, PutAck, PutMerges, PutStatus
 from scenarios.config import Scenario
 from scenarios.hostile import Liar
 from scenarios.recording import Log, Recording
@@ -251,6 +253,7 @@ class SimNode(Process):
     def __init__(self, simulation: "Simulation", name: str, rng: np.random.Generator) -> None:
         super().__init__(simulation, name, rng)
         self.core: FusionCore | None = None
+        self.served = b""
         self._effects: list[Effect] = []
         self._flushing = False
 
@@ -259,7 +262,7 @@ class SimNode(Process):
         self.core = FusionCore(scenario.fleet.name, self.name, scenario.fusion, expected=len(simulation.vehicles))
         self.core.restore(self.disk.load(), self.clock_s)
         simulation.on_boot(self)
-        self._effects, self._flushing = [], False
+        self._effects, self._flushing, self.served = [], False, b""
         self.later(FUSION_TICK_S, self._tick)
 
     def _die(self) -> None:
@@ -314,6 +317,14 @@ class SimNode(Process):
                     else [simulation.vehicles.get(vehicle)]
                 )
                 self._ask(vehicle, epoch, data, [each for each in asked if each is not None])
+            case PutMerges(data=data):
+                for other in simulation.nodes.values():
+                    if other is not self:
+                        self.send(other, data, lambda copy, other=other: other.on_merges(self.name, copy))  # type: ignore[misc]
+            case AskMap(node=name):
+                peer = simulation.nodes[name]
+                if peer.served:
+                    peer.send(self, peer.served, lambda copy: self.on_map(name, copy))
             case AskEvents(node=node):
                 peer = simulation.nodes[node]
                 replies = peer.core.answer_events() if peer.core is not None else []
@@ -350,6 +361,20 @@ class SimNode(Process):
     def on_status(self, node: str, data: bytes) -> None:
         assert self.core is not None
         self._take(self.core.on_status(node, data, self.clock_s))
+
+    def serve(self, joint: JointMap, merges: Merges) -> None:
+        """Serve a map; simulated nodes make none of their own accord."""
+        assert self.core is not None
+        self.served = encode_map(joint)
+        self._take(self.core.on_served(joint, merges))
+
+    def on_merges(self, node: str, data: bytes) -> None:
+        assert self.core is not None
+        self._take(self.core.on_merges(node, data))
+
+    def on_map(self, node: str, data: bytes) -> None:
+        assert self.core is not None
+        self._take(self.core.on_map(node, data))
 
     def on_events(self, node: str, data: bytes) -> None:
         assert self.core is not None

@@ -23,19 +23,22 @@ from scenarios import output, watch
 from scenarios.access import Kind, Member
 from scenarios.children import signer_of
 from scenarios.keys import make_keys
+from scenarios.watch_merges import merging
 
 
 def show_status(source: watch.Source, as_json: bool, console: Console) -> None:
     """Print how every vehicle of a fleet is, as a fusion node sees it. Raises RunError where no map comes."""
-    joint = asyncio.run(watch.newest_map(source))
+    joint, report = asyncio.run(watch.newest_map(source))
     if as_json:
-        console.print_json(json.dumps(watch.as_dict(joint)))
+        console.print_json(json.dumps(watch.as_dict(joint, report)))
         return
     console.print(
         f"node {joint.node}  map {joint.version}  {len(joint.names)} landmarks  digest {joint.map_digest.hex()[:16]}"
     )
     console.print(watch.vehicle_table(joint.vehicles))
-    for text in watch.faults(joint.vehicles):
+    for part in merging(joint, report):
+        console.print(part, highlight=False, soft_wrap=True)
+    for text in (*watch.doubtful(joint.vehicles), *watch.faults(joint.vehicles)):
         console.print(text, highlight=False, soft_wrap=True)
     for name, count in joint.counters.items():
         console.print(f"{name} {count}")

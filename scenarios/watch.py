@@ -16,10 +16,15 @@ from rich.text import Text
 
 from fleet_seif.client import FleetClient, connect
 from fleet_seif.errors import RunError
+from fleet_seif.merge_records import MergeReport
 from fleet_seif.messages import JointMap, VehicleState
 from fleet_seif.signing import load_key_ring
+from fusion.mapping import CANDIDATES, REFUSED
+from scenarios.watch_merges import merging, merging_dict
 
 FIRST_S = 10.0
+MERGES_S = 1.0
+DOUBTFUL_MAX = 20
 GRID_ROWS = 22
 GRID_COLUMNS = 72
 
@@ -44,18 +49,19 @@ async def watch(source: Source, as_json: bool, console: Console) -> None:
     async with source.connect() as client:
         if as_json:
             async for joint in client.maps():
-                print(json.dumps(as_dict(joint)), flush=True)  # noqa: T201
+                print(json.dumps(as_dict(joint, await client.merges(joint.node))), flush=True)  # noqa: T201
             return
         with Live(Text(f"waiting for the map of fleet {source.fleet} ..."), console=console) as live:
             async for joint in client.maps():
-                live.update(picture(joint))
+                live.update(picture(joint, await client.merges(joint.node)))
 
 
-async def newest_map(source: Source) -> JointMap:
-    """The map that a fusion node serves now. Raises RunError where none comes."""
+async def newest_map(source: Source) -> tuple[JointMap, MergeReport | None]:
+    """The map that a fusion node serves now, and what it says of the merges. Raises RunError where no map comes."""
     async with source.connect() as client:
         try:
-            return await asyncio.wait_for(anext(client.maps()), FIRST_S)
+            joint = await asyncio.wait_for(anext(client.maps()), FIRST_S)
+            return joint, await client.merges(joint.node, MERGES_S)
         except TimeoutError:
             raise RunError(f"no map of fleet {source.fleet!r} within {FIRST_S:.0f} s: is that its name?") from None
 
@@ -65,8 +71,8 @@ def state_dict(state: VehicleState) -> dict[str, Any]:
     return {**vars(state), "epoch": list(state.epoch)}
 
 
-def as_dict(joint: JointMap) -> dict[str, Any]:
-    """A map as JSON values."""
+def as_dict(joint: JointMap, report: MergeReport | None = None) -> dict[str, Any]:
+    """A map as JSON values, with what its node says of the merges in it."""
     return {
         "fleet": joint.fleet,
         "node": joint.node,
@@ -88,11 +94,12 @@ def as_dict(joint: JointMap) -> dict[str, Any]:
         "poses": {name: joint.pose_mean[i].tolist() for i, name in enumerate(joint.poses)},
         "vehicles": [state_dict(state) for state in joint.vehicles],
         "counters": joint.counters,
+        "merging": None if report is None else merging_dict(report),
     }
 
 
-def picture(joint: JointMap) -> RenderableType:
-    """Map, uncertainty and the health of each vehicle."""
+def picture(joint: JointMap, report: MergeReport | None = None) -> RenderableType:
+    """Map, uncertainty, who saw what, what was kept apart, and the health of each vehicle."""
     deviation = ""
     if len(joint.landmark_cov):
         largest = np.sqrt(np.linalg.eigvalsh(joint.landmark_cov)[:, -1])
@@ -103,9 +110,10 @@ def picture(joint: JointMap) -> RenderableType:
         f"{len(joint.names)} landmarks ({shared} shared){deviation}"
     )
     counted = joint.counters
-    if counted.get("merge_candidates"):
-        head += f"  {counted['merge_candidates']} pairs compared, {counted.get('merges_refused', 0)} kept apart"
-    return Group(Text(head), grid(joint), vehicle_table(joint.vehicles), *map(Text, faults(joint.vehicles)))
+    if counted.get(CANDIDATES):
+        head += f"  {counted[CANDIDATES]} pairs compared, {counted.get(REFUSED, 0)} kept apart"
+    words = [*doubtful(joint.vehicles), *faults(joint.vehicles)]
+    return Group(Text(head), grid(joint), *merging(joint, report), vehicle_table(joint.vehicles), *map(Text, words))
 
 
 def vehicle_table(states: Sequence[VehicleState]) -> Table:
@@ -124,6 +132,13 @@ def vehicle_table(states: Sequence[VehicleState]) -> Table:
 def faults(states: Sequence[VehicleState]) -> list[str]:
     """Why vehicles are quarantined, a line each."""
     return [f"{s.name} is quarantined: {s.fault}" for s in states if s.fault]
+
+
+def doubtful(states: Sequence[VehicleState]) -> list[str]:
+    """Which vehicles say that they are doubtful, in a line; none: no line."""
+    names = sorted({s.name for s in states if not s.healthy and not s.fault})
+    more = f" and {len(names) - DOUBTFUL_MAX} more" if len(names) > DOUBTFUL_MAX else ""
+    return [f"doubtful, not fused: {', '.join(names[:DOUBTFUL_MAX])}{more}"] if names else []
 
 
 def state_words(s: VehicleState, states: Sequence[VehicleState]) -> str:

@@ -47,9 +47,7 @@ def main() -> None:
     spent_us(200, FilterSettings(identities="associated"))  # compiles
     for landmarks in parser.parse_args().landmarks:
         known, *_ = spent_us(landmarks, FilterSettings())
-        step, closing, longest, framed = spent_us(
-            landmarks, FilterSettings(identities="associated", close_lag_steps=12)
-        )
+        step, closing, longest, framed = spent_us(landmarks, FilterSettings(identities="associated"))
         closing, longest = closing / 1e3, longest / 1e3
         report = (
             f"{landmarks:6d} landmarks ({len(framed.signatures)} begun): step {step:5.0f} us, with identities"

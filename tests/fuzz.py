@@ -56,7 +56,7 @@ from vehicles.core import Identity, VehicleCore
 STRANGER: Final = golden.signer(Role.VEHICLE, "v1", 77)
 SIGNERS: Final = (None, VEHICLE, NODE, OPERATOR, STRANGER)
 OWN: Final = {"delta": VEHICLE, "heartbeat": VEHICLE, "ack": NODE, "range": NODE, "snapshot": VEHICLE, "map": NODE,
-              "event": OPERATOR, "status": NODE}  # fmt: skip
+              "event": OPERATOR, "status": NODE, "merges": NODE}  # fmt: skip
 """Who signs a kind: the key that an attacker inside the fleet has. The others have none."""
 RENEW: Final = 500
 """Inputs after which the receivers are made anew: what is valid fills them."""
@@ -237,6 +237,8 @@ class Receivers:
                 core.on_heartbeat("v1", data, 1.0)
             case "status":
                 core.on_status("fusion", data, 1.0)
+            case "merges":
+                core.on_merges("fusion", data)
             case "event" | "evidence":
                 core.on_events("fusion", data)
             case "ack":

@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from fleet_seif import envelope, map_wire, node_wire, wire
+from fleet_seif import envelope, map_wire, merge_wire, node_wire, wire
 from fleet_seif.information import QUANTA_MAX, VARIABLE_MAX, FrameDelta, block_size, row_offsets, variable_size
 from fleet_seif.map_wire import Piece
+from fleet_seif.merge_records import Differing, KeptApart, MergeReport, Reason
 from fleet_seif.messages import (
     Ack,
     Action,
@@ -85,6 +86,7 @@ KINDS = {
     "event": Kind(8, OperatorEvent, node_wire.encode_event, node_wire.decode_event),
     "status": Kind(9, NodeStatus, node_wire.encode_status, node_wire.decode_status),
     "evidence": Kind(10, Evidence, node_wire.encode_evidence, node_wire.decode_evidence),
+    "merges": Kind(11, MergeReport, merge_wire.encode_merges, merge_wire.decode_merges),
 }
 
 
@@ -216,6 +218,17 @@ RANGE = RangeRequest(fleet=FLEET, vehicle="v1", epoch=Epoch(0, 7), first=64, las
 RANGE_EDGE = RangeRequest(
     fleet="-" * 32, vehicle="_" * 32, epoch=Epoch(0, 0), first=SEQUENCE_MAX, last=SEQUENCE_MAX, count=4096
 )
+ONE, OTHER, THIRD = LandmarkName("v1", 0, 3), LandmarkName("v2", 1, 0), LandmarkName("v3", 0, VARIABLE_MAX)
+MERGES = MergeReport(
+    fleet=FLEET, node="fusion", version=17, canonical=True, map_digest=DIGEST_1, ledger_digest=DIGEST_2,
+    kept_apart=((Reason.AMBIGUOUS, 12), (Reason.UNSOLVED, 1)),
+    nearest=(KeptApart(ONE, OTHER, Reason.AMBIGUOUS, 2.5), KeptApart(OTHER, THIRD, Reason.UNSOLVED, None)),
+    differing=(Differing("fusion2", (ONE, OTHER), ((ONE,), (OTHER, THIRD))), Differing("n", (THIRD,), ())),
+)  # fmt: skip
+MERGES_EMPTY = MergeReport(
+    fleet="-" * 32, node="_" * 32, version=SEQUENCE_MAX, canonical=False, map_digest=bytes(32), ledger_digest=bytes(32),
+    kept_apart=(), nearest=(),
+)  # fmt: skip
 
 Example = tuple[Any, Signer | None]
 EXAMPLES: dict[str, Example] = {
@@ -272,6 +285,8 @@ EXAMPLES: dict[str, Example] = {
         second=wire.encode_message(message(4, 6), VEHICLE),
     ), None),
     "evidence-empty": (Evidence(first=b"", second=b""), None),
+    "merges": (MERGES, NODE),
+    "merges-empty": (MERGES_EMPTY, None),
 }  # fmt: skip
 """Name and record; the name begins with the kind. Who signs it, None: nobody."""
 

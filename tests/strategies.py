@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 from hypothesis.strategies import SearchStrategy
 
 from fleet_seif.information import H_QUANTUM, QUANTA_MAX, VARIABLE_MAX, FrameDelta, block_size, row_offsets
+from fleet_seif.merge_records import Differing, KeptApart, MergeReport, Reason
 from fleet_seif.messages import (
     Ack,
     Action,
@@ -219,6 +220,26 @@ def statuses() -> SearchStrategy[NodeStatus]:
         node=NAMES,
         streams=st.lists(position, max_size=3).map(tuple),
         events=DIGESTS,
+    )
+
+
+def merge_reports() -> SearchStrategy[MergeReport]:
+    reason = st.sampled_from([each for each in Reason if each is not Reason.MERGED])
+    names = st.lists(landmark_names(), max_size=3).map(tuple)
+    d2 = st.one_of(st.none(), st.floats(0.0, 1e300))
+    return st.builds(
+        MergeReport,
+        fleet=NAMES,
+        node=NAMES,
+        version=st.integers(0, 2**53),
+        canonical=st.booleans(),
+        map_digest=DIGESTS,
+        ledger_digest=DIGESTS,
+        kept_apart=st.lists(st.tuples(reason, st.integers(1, 2**53)), max_size=6).map(tuple),
+        nearest=st.lists(st.builds(KeptApart, landmark_names(), landmark_names(), reason, d2), max_size=3).map(tuple),
+        differing=st.lists(st.builds(Differing, NAMES, names, st.lists(names, max_size=2).map(tuple)), max_size=2).map(
+            tuple
+        ),
     )
 
 

@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,13 @@ from typer.testing import Result
 
 from fleet_seif.bus import open_bus
 from fleet_seif.config import FusionSettings
+from fleet_seif.keys import Keys
+from fleet_seif.map_wire import encode_map
+from fleet_seif.merge_wire import encode_merges
 from fleet_seif.sqlite_store import SqliteStore
 from fleet_seif.store import Change, Put
 from fusion import records
-from fusion.core import FusionCore
+from fusion.core import CLASSES_DIFFERING, FusionCore
 from fusion.ledger import Ledger
 from fusion.service import FusionService
 from scenarios import children, watch
@@ -292,6 +296,48 @@ def test_status_says_how_every_vehicle_is(node: Network) -> None:
     assert joint["node"] == "fusion"
     assert [(state["name"], state["cut"], state["behind"]) for state in joint["vehicles"]] == [("v1", 70, 0)]
     assert joint["map_digest"][:16] in told.stdout
+    assert joint["merging"]["version"] <= joint["version"]
+    assert joint["merging"]["kept_apart"] == {}
+
+
+@pytest.fixture
+def ended(network: Network, held: Ledger) -> Iterator[Network]:
+    """A fusion node that holds all of a run, and waits for more vehicles."""
+    core = FusionCore("fleet", "fusion", FusionSettings())
+    core.restore([(each.key, each.value) for each in held.contents() if isinstance(each, Put)], 0.0)
+    service = FusionService(network.bus, core, FusionSettings())
+    working = threading.Thread(target=service.run)
+    working.start()
+    try:
+        wait_until(lambda: service.newest.canonical and service.newest.names, "a canonical map")
+        yield network
+    finally:
+        service.stop()
+        working.join()
+
+
+def test_status_names_the_landmarks_that_another_node_has_merged_otherwise(ended: Network) -> None:
+    """It is told so by a node that has joined the first two landmarks in its map of the same ledger."""
+    keys = Keys("fleet")
+    ours, said = asyncio.run(watch.newest_map(watch.Source([ended.endpoint], "fleet")))
+    assert said is not None
+    one, two, *others = ours.names
+    theirs = replace(
+        ours, node="fusion2", map_digest=bytes(32), names=((*one, *two), *others), signature=ours.signature[1:],
+        landmark_mean=ours.landmark_mean[1:], landmark_cov=ours.landmark_cov[1:],
+    )  # fmt: skip
+    report = encode_merges(replace(said, node="fusion2", map_digest=bytes(32)))
+    with open_bus(connect=[ended.endpoint]) as bus:
+        bus.answer(keys.map("fusion2"), lambda key, data: [encode_map(theirs)])
+
+        def told() -> str:
+            bus.put(keys.merges("fusion2"), report)
+            return status(ended.endpoint).stdout
+
+        words = f"merged otherwise by fusion2: {'/'.join(map(str, one[0]))}"
+        wait_until(lambda: words in told(), "the landmarks to be named")
+        wait_until(lambda: f"{CLASSES_DIFFERING} 2" in told(), "the landmarks to be counted")
+        assert "malformed" not in told()
 
 
 def test_status_counts_what_is_malformed(node: Network) -> None:

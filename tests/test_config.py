@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from fleet_seif.config import AssociationSettings, FilterSettings
 from scenarios.config import ScenarioError, load_scenario, shipped
 
 WORLD = "[world]\nlandmarks = 10\nroutes = 'coverage'\n"
@@ -41,6 +42,7 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
         ("[dataset]\nkind = 'mrclam'\n[detection]\nmissed_share = 0.1\n", ["[detection]", "signatures only"]),
         (WORLD + "[detection]\nsignatures = 'none'\n", ["refused", 'filter.identities = "associated"']),
         (WORLD + "[filter]\nidentities = 'associated'\nframes = 'single'\n", ["[filter]", 'frames = "adaptive"']),
+        (WORLD + "[filter]\nidentities = 'guessed'\n", ["[filter.identities]", "'signatures' or 'associated'"]),
         ("[world\n", ["not TOML"]),
     ],
 )
@@ -53,12 +55,23 @@ def test_a_wrong_file_is_refused_with_the_place_and_what_is_allowed(
         load_scenario(str(path))
     for word in [str(path), *words]:
         assert word in str(caught.value)
+    assert "default factory" not in str(caught.value)
 
 
 def test_set_changes_a_key_and_keeps_the_rest() -> None:
     plain, changed = load_scenario("fleet"), load_scenario("fleet", ("fleet.vehicles=7",), seed=9)
     assert (changed.fleet.vehicles, changed.run.seed) == (7, 9)
     assert changed.world == plain.world
+
+
+def test_the_correction_of_a_frame_waits_for_landmarks_to_be_confirmed_where_the_vehicle_finds_out_which_they_are() -> (
+    None
+):
+    told = AssociationSettings(confirm_steps=20)
+    assert FilterSettings(association=told).close_lag_steps == 2
+    assert FilterSettings(identities="associated").close_lag_steps == 12
+    assert FilterSettings(identities="associated", association=told).close_lag_steps == 30
+    assert FilterSettings(identities="associated", close_lag_steps=3).close_lag_steps == 3
 
 
 @pytest.mark.parametrize("override", ["fleet.vehicles", "vehicles=3", "fleet..n=3", "=3"])

@@ -9,7 +9,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from fleet_seif.records import Floats
+from fleet_seif.merge_records import Considered, Merges, Reason
 from scenarios.association import Truths, assigned_truth
 from scenarios.config import load_scenario
 from scenarios.figure import DPI, SIZE_IN, FigureTimes, Kind, draw_figure, figure_times
@@ -29,13 +29,12 @@ def paper() -> Recording:
 
 
 @cache
-def tiny_run() -> tuple[Recording, FinishedRun, dict[str, Floats]]:
+def tiny_run() -> tuple[Recording, FinishedRun]:
     """Few steps of three vehicles among whom some share landmarks."""
     changes = ("fleet.vehicles=3", "world.landmarks=20", "world.steps=12", "run.rate_hz=0")
     scenario = load_scenario("fleet", changes)
     recording = record(scenario)
-    run = run_virtual("fleet", scenario, recording)
-    return recording, run, {name: drive.pose for name, drive in run.drives.items()}
+    return recording, run_virtual("fleet", scenario, recording)
 
 
 def moments_at(times: FigureTimes) -> list[Moment]:
@@ -56,7 +55,7 @@ def draw(path: Path, kind: Kind, recording: Recording, moments: Sequence[Moment]
         recording=recording,
         times=times,
         moments=moments_at(times) if moments is None else moments,
-        tracks=tiny_run()[2],
+        drives=tiny_run()[1].drives,
         truths=truths_of(recording),
     )
     data = path.read_bytes()
@@ -135,3 +134,15 @@ def test_gaps_in_the_truth_leave_gaps_in_the_picture_only(tmp_path: Path) -> Non
 
 def test_a_run_of_which_no_map_is_known_can_be_drawn(tmp_path: Path) -> None:
     draw(tmp_path / "a.png", "overview", tiny_run()[0], [])
+
+
+def test_pairs_kept_apart_and_doubtful_vehicles_show_in_the_picture(tmp_path: Path) -> None:
+    recording = tiny_run()[0]
+    moment = moments_at(figure_times("overview", recording))[-1]
+    one, two = (names[0] for names in moment.solution.classes[:2])
+    apart = Merges(moment.solution.classes, considered=(Considered(one, two, 3.0, Reason.AMBIGUOUS),))
+    pictures = [
+        draw(tmp_path / "a.png", "overview", recording, [each])
+        for each in (moment, replace(moment, merges=apart), replace(moment, doubtful=frozenset({"v2"})))
+    ]
+    assert len(set(pictures)) == 3

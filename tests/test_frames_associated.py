@@ -28,7 +28,7 @@ from scenarios.source import record
 from tests.drives import FLEET, ODOMETRY_STD, Drive, drive, put, reading, square
 from vehicles.core import Identity, VehicleCore
 
-SETTINGS = FilterSettings(identities="associated", close_lag_steps=12)
+SETTINGS = FilterSettings(identities="associated")
 
 
 @cache

@@ -12,7 +12,7 @@ from typing import Any
 import msgpack
 import pytest
 
-from fleet_seif import delta_wire, envelope, information, map_wire, messages, node_wire, wire
+from fleet_seif import delta_wire, envelope, information, map_wire, merge_records, messages, node_wire, wire
 from fleet_seif.envelope import DIGEST_END, SIGNATURE, authenticate, body_digest
 from fleet_seif.streams import EMPTY_PREFIX, extend_prefix
 from tests import golden
@@ -22,7 +22,7 @@ SIZE_MAX = 200_000
 FORMAT = (Path(envelope.__file__).parent / "FORMAT.md").read_text()
 LIMITS = {
     name: getattr(module, name)
-    for module in (messages, node_wire, map_wire, wire, information, delta_wire, envelope)
+    for module in (messages, node_wire, map_wire, merge_records, wire, information, delta_wire, envelope)
     for name in dir(module)
     if name.endswith("_MAX") or name in ("PIECE_BYTES", "VARIANCE_MIN")
 }
@@ -59,7 +59,7 @@ def test_every_kind_has_an_ordinary_and_an_edge_message_signed_and_unsigned() ->
         assert len(mine) >= 2, kind
         assert {read(name)[0][4] for name in mine} == {KINDS[kind].number}
     signed = {EXAMPLES[name][0].__class__ for name in EXAMPLES if EXAMPLES[name][1] is not None}
-    assert len(signed) == 8, "all but pieces and evidence"
+    assert len(signed) == 9, "all but pieces and evidence"
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -81,10 +81,10 @@ def section(title: str) -> str:
 
 
 def test_the_worked_message_in_the_format_is_the_golden_one() -> None:
-    lines = re.findall(r"^    ((?:[0-9a-f]{2} *)+)(?:\s|$)", section("### 6.14 A whole message"), re.MULTILINE)
+    lines = re.findall(r"^    ((?:[0-9a-f]{2} *)+)(?:\s|$)", section("### 6.15 A whole message"), re.MULTILINE)
     data, _ = read("delta-step")
     assert bytes.fromhex("".join(lines)) == data
-    assert f"{len(data)} bytes" in section("### 6.14 A whole message")
+    assert f"{len(data)} bytes" in section("### 6.15 A whole message")
 
 
 def test_the_worked_delta_in_the_format_is_that_of_the_golden_message() -> None:
@@ -115,7 +115,7 @@ def test_the_limits_in_the_format_are_those_of_the_code() -> None:
 
 
 FIELD_COUNTS = {"delta": 16, "heartbeat": 8, "ack": 7, "range": 6, "snapshot": 3, "piece": 5, "map": 7,
-                "event": 5, "status": 4, "evidence": 2}  # fmt: skip
+                "event": 5, "status": 4, "evidence": 2, "merges": 4}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_seif import envelope, node_wire
+from fleet_seif import envelope, merge_wire, node_wire
 from fleet_seif.messages import Action, Evidence, LandmarkName, NodeStatus, OperatorEvent
 from tests import strategies
+from tests.golden import MERGES, MERGES_EMPTY
 from tests.reference import same
 from tests.strategies import settled
 from tests.test_wire import NASTY, Kind, check_refused_or_canonical, fields_of, refused, replaced, sealed
@@ -20,6 +21,9 @@ KINDS = {
     "status": Kind(envelope.KIND_STATUS, node_wire.encode_status, node_wire.decode_status, strategies.statuses()),
     "evidence": Kind(
         envelope.KIND_EVIDENCE, node_wire.encode_evidence, node_wire.decode_evidence, strategies.evidences()
+    ),
+    "merges": Kind(
+        envelope.KIND_MERGES, merge_wire.encode_merges, merge_wire.decode_merges, strategies.merge_reports()
     ),
 }
 RECORDS = st.sampled_from(sorted(KINDS)).flatmap(lambda name: st.tuples(st.just(KINDS[name]), KINDS[name].records))
@@ -140,4 +144,26 @@ def test_evidence_that_is_not_two_messages_is_refused(fields: list[object]) -> N
 def test_one_kind_is_not_read_as_another(decode: Callable[[bytes], Any]) -> None:
     written = [node_wire.encode_event(FORCE), node_wire.encode_status(STATUS)]
     written.append(node_wire.encode_evidence(Evidence(first=b"", second=b"")))
-    assert sum(refused(decode, data) for data in written) == 2
+    written.append(merge_wire.encode_merges(MERGES_EMPTY))
+    assert sum(refused(decode, data) for data in written) == 3
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [
+        (1, [["merged", 1]]),  # what is merged is not kept apart
+        (1, [["few", 0]]),
+        (1, [["few", 1]] * 7),
+        (2, [[["v", 0, 0], ["w", 0, 0], "few", -1.0]]),
+        (2, [[["v", 0, 0], ["w", 0, 0], "few", float("inf")]]),
+        (2, [[["v", 0, 0], ["w", 0, 0], "few", 1]]),
+        (2, [[["v", 0, 0], ["w", 0, 0], "few", 1.0]] * 49),
+        (3, [["n", [], []]] * 33),
+        (3, [["a/b", [], []]]),
+    ],
+)
+def test_a_report_of_merges_that_breaks_a_rule_is_refused(at: int, value: object) -> None:
+    data = merge_wire.encode_merges(MERGES)
+    assert refused(
+        merge_wire.decode_merges, sealed(envelope.KIND_MERGES, msgpack.packb(replaced(fields_of(data), [at], value)))
+    )

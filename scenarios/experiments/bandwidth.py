@@ -19,7 +19,7 @@ from fleet_seif.records import Reading
 from scenarios.config import load_scenario
 from scenarios.experiments import drawing
 from scenarios.experiments.study import Cell, Progress, Row, csv_of, png_of, write_csv
-from scenarios.figure import INK
+from scenarios.palette import INK
 from scenarios.recording import Log
 from scenarios.source import record
 from vehicles.core import Identity, VehicleCore

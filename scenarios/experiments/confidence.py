@@ -20,7 +20,7 @@ from scenarios.experiments.association import likelihood_errors
 from scenarios.experiments.measures import EIF, EKF, Candidate, Outcome, compare, seif
 from scenarios.experiments.study import Progress, Row, csv_of, png_of, write_csv
 from scenarios.experiments.worlds import COMPASS, compass_world, paper_world
-from scenarios.figure import GREY, INK
+from scenarios.palette import GREY, INK
 from scenarios.score import BAND, chi_square_band
 
 NAME: Final = "confidence"

@@ -23,7 +23,7 @@ from scenarios.experiments import drawing
 from scenarios.experiments.measures import EKF, Drive, F, drive, map_error_m, seif
 from scenarios.experiments.study import Cell, Progress, Row, csv_of, png_of, write_csv
 from scenarios.experiments.worlds import World, paper_world
-from scenarios.figure import GREY, INK, SMALL
+from scenarios.palette import GREY, INK, SMALL
 
 NAME: Final = "correlation"
 TITLE: Final = "Correlation is dense, information is nearly sparse: EKF and SEIF (SEIF paper, Fig. 1, 7)"

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 
 from fleet_seif.records import Floats
-from scenarios.figure import DPI, FAINT, FEW_COLOURS, GREY, INK, LARGE, PLAIN, SMALL
+from scenarios.figure import DPI
+from scenarios.palette import FAINT, FEW_COLOURS, GREY, INK, LARGE, PLAIN, SMALL
 
 BLUE, VERMILION, GREEN, PINK, ORANGE, SKY = FEW_COLOURS
 EKF_COLOUR, SEIF_COLOUR, ESEIF_COLOUR, EXACT_COLOUR = INK, BLUE, GREEN, VERMILION

@@ -36,14 +36,13 @@ def run(out: Path, seed: int, quick: bool, progress: Progress) -> list[Row]:
     finished = run_virtual(SCENARIO, scenario, recording, step)
     times = figure_times("meetings", recording)
     moments = list(replay(finished.ledger, times.times_s))
-    tracks = {name: drive.pose for name, drive in finished.drives.items()}
     draw_figure(
         png_of(out, NAME),
         title=TITLE,
         recording=recording,
         times=times,
         moments=moments,
-        tracks=tracks,
+        drives=finished.drives,
         truths=finished.truths,
     )
     write_csv(csv_of(out, NAME), [_line(moment, finished) for moment in moments])

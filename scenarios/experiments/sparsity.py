@@ -18,7 +18,7 @@ from scenarios.experiments.drawing import mean, median
 from scenarios.experiments.measures import EKF, Candidate, Outcome, compare, seif
 from scenarios.experiments.study import NOT_PRINTED, Progress, Row, csv_of, png_of, write_csv
 from scenarios.experiments.worlds import paper_world
-from scenarios.figure import INK
+from scenarios.palette import INK
 
 NAME: Final = "sparsity"
 TITLE: Final = "Time and error against the number of active landmarks (SEIF paper, Fig. 14)"
