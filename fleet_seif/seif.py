@@ -238,14 +238,19 @@ class Seif:
         unit[rows, np.arange(len(rows))] = 1.0
         return np.asarray(scipy.sparse.linalg.splu(H).solve(unit)[rows])
 
-    def blanket_covariance(self, number: int) -> Floats:
-        """Covariance of the pose and one landmark from their neighbourhood alone, shape (5, 5): eq. (54), (55).
+    def blanket_covariance(self, numbers: Sequence[int]) -> Floats:
+        """Joint covariance of the pose and these landmarks from their neighbourhood alone, shape (3 + 2 k, 3 + 2 k).
 
-        The rest of the map is conditioned on, not marginalised out, so the result is at most the exact one. The
-        neighbourhood is the active landmarks, this one and its neighbours; where they do not meet, the landmarks of a
-        shortest path between them belong to it too. Its cost follows the neighbourhood.
+        SEIF paper eq. (54), (55), for several landmarks:  P = S (H_BB)^-1 S',  S taking pose and landmarks out of B
+
+        B, the combined Markov blanket: the pose, the active landmarks, these landmarks and their neighbours; where a
+        landmark and its neighbours do not meet the others, the landmarks of a shortest path to them belong to it too.
+        The rest of the map is conditioned on, not marginalised out, so the result is at most the exact one. Its cost
+        follows B, not the map.
         """
-        ids = kernels.blanket(self._s, number)
+        ids = kernels.blanket(self._s, np.array(numbers, np.int64))
         H, _, _, _, _ = kernels.gather(self._s, ids)
-        rows = [0, 1, 2, *(3 + 2 * int(np.searchsorted(ids, number)) + axis for axis in (0, 1))]
-        return np.asarray(np.linalg.solve(H, np.eye(len(H))[:, rows])[rows])
+        at = np.searchsorted(ids, numbers)
+        rows = np.concatenate([np.arange(3), (3 + 2 * at[:, None] + np.arange(2)).ravel()])
+        P = np.linalg.solve(H, np.eye(len(H))[:, rows])[rows]
+        return np.asarray((P + P.T) / 2)
