@@ -38,7 +38,7 @@ from fleet_seif.local_map import (
     with_new,
 )
 from fleet_seif.models import COMPASS_XY
-from fleet_seif.own_duplicates import Duplicates, own_duplicates
+from fleet_seif.own_duplicates import Duplicates, crowded, own_duplicates
 from fleet_seif.records import Floats, Ints
 from fleet_seif.seif import FAULTS
 from fleet_seif.seif_step import check_reading
@@ -170,6 +170,10 @@ class Associator:
     def duplicates(self) -> Duplicates:
         """Landmarks that have been begun twice (rule 3): pairs of keys."""
         return own_duplicates(self.local, lambda a, b: self._together[min(a, b), max(a, b)] >= TOGETHER_LEAST)
+
+    def crowded(self) -> float:
+        """Share of landmarks that lie where hardly two can (own_duplicates)."""
+        return crowded(self.local, lambda a, b: self._together[min(a, b), max(a, b)] >= TOGETHER_LEAST)
 
     @one_thread
     def begin(self, step: int, near: LocalMap, travel_max_m: float) -> None:

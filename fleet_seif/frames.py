@@ -13,6 +13,10 @@
    the closed frames say about where the open one starts and what lies around it (own_map). Where too many landmarks may
    be another one, or the frames do not fit each other, the vehicle has probably taken some for their neighbours: it is
    doubtful until a frame closes after which neither is so.
+8. With frames = "single" what lies around the pose comes from the one filter itself, every frame_steps_max steps
+   (surroundings), and only the sighting that has a landmark accepted, and later ones, enter the filter: earlier ones
+   would have to be worked into poses that are gone. Landmarks begun twice become aliases, and the filter holds them
+   together (seif_join).
 """
 
 import dataclasses
@@ -39,12 +43,16 @@ from fleet_seif.models import RANGE_BEARING
 from fleet_seif.own_map import OwnMap, first_names
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 from fleet_seif.seif import Seif, Taken
+from fleet_seif.surroundings import around_pose
 
 log = logging.getLogger(__name__)
 AGAIN_FRAMES = 4
 """A frame is looked at again when so many more have closed."""
 FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
+
+CROWDED_MAX = 0.15
+"""A vehicle of a single frame is doubtful while a larger share of the landmarks around are crowded (own_duplicates)."""
 
 
 def _told(seen: Sightings, decision: Decision | None) -> Sightings:
@@ -100,6 +108,7 @@ class FramedFilter:
         self._localised, self._asked = 0, (0, np.zeros(3))
         self._names = Names()
         self._single = settings.frames == "single"
+        self._has_names = not self._single or settings.identities == "associated"
         self._frame_settings = settings
         if not self._single:
             most = min(settings.landmarks_max, FRAME_LANDMARKS_MAX)
@@ -116,7 +125,7 @@ class FramedFilter:
 
     def _open(self) -> None:
         """Begin a frame; it is published with its first step."""
-        self.filter = Seif(self._frame_settings, self.model, None if self._single else self._names)
+        self.filter = Seif(self._frame_settings, self.model, self._names if self._has_names else None)
         self._log = FrameLog()
         self._opened = False
 
@@ -154,7 +163,9 @@ class FramedFilter:
     def landmarks(self) -> Floats:
         """Live landmarks in the coordinates of frame 0, m, shape (n, 2), by number; NaN for one that is none."""
         if self._single:
-            return self.filter.landmarks
+            landmarks = self.filter.landmarks
+            landmarks[first_names(self._own_map.aliases, len(landmarks)) != np.arange(len(landmarks))] = np.nan
+            return landmarks
         found = np.full((len(self.signatures), 2), np.nan)
         found[: len(self._map)] = self._map
         own = self.filter.called
@@ -240,6 +251,8 @@ class FramedFilter:
             result, taken = self._take_decision(decision, result, seen)
         self._assigned.append(taken[4])
         if self._single:
+            if self._is_round_over():
+                result = dataclasses.replace(result, delta=self._look_around_pose(result.delta))
             return result, (FramePart(frame=frame, status=status, delta=result.delta),)
         self._log.add(moves, taken, self.filter.pose)
         if not self._is_over():
@@ -318,6 +331,28 @@ class FramedFilter:
         limits = self.settings.association
         self.doubtful = duplicates.unclear > limits.unclear_max or self._own_map.misfit > limits.misfit_max
 
+    def _is_round_over(self) -> bool:
+        """Whether what lies around a vehicle of a single frame is to be looked at anew."""
+        associator, every = self._associator, self.settings.frame_steps_max
+        return associator is not None and (self.steps % every == 0 or associator.has_left(associator.local.pose))
+
+    def _look_around_pose(self, step: FrameDelta) -> FrameDelta:
+        """Rule 8, after a step with this delta; what is published instead of it."""
+        associator, limits = self._associator, self.settings.association
+        assert associator is not None
+        duplicates = associator.duplicates()
+        self._alias(duplicates.pairs)
+        first = np.unique(first_names(self._own_map.aliases, len(self._names.signatures)))
+        try:
+            step = self.filter.join(duplicates.pairs, step)
+            near = around_pose(self.filter, first, limits.local_landmarks_max, associator.reach_m)
+        except NumericalError as error:
+            log.warning("not_looked_around step=%d reason=%s", self.steps, error)
+            near = begun_at(kept(associator.local, np.flatnonzero(associator.local.keys >= 0))), associator.travel_max_m
+        associator.begin(self.steps, *near)
+        self.doubtful = duplicates.unclear > limits.unclear_max or associator.crowded() > CROWDED_MAX
+        return step
+
     def _alias(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Landmarks that are one from now on."""
         for pair in pairs:
@@ -394,9 +429,11 @@ class FramedFilter:
         """Close the open frame and correct all that is outstanding."""
         parts: list[FramePart] = []
         if self._opened:
-            frame, nothing = self.frame, FrameDelta.nothing()
+            frame, last = self.frame, FrameDelta.nothing()
+            if self._single and self._associator is not None:
+                last = self._look_around_pose(last)
             end_pose = self.filter.pose if self._single else self._close()
-            parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=nothing, end_pose=end_pose))
+            parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=last, end_pose=end_pose))
         for closed in self._closed:
             parts += self._corrected(closed)
         for closed in self._looked_at:
@@ -413,26 +450,34 @@ class FramedFilter:
             "filter": self.filter.state(), "steps": self.steps, "opened": self._opened, "assigned": assigned.tobytes(),
             "associator": self._associator and self._associator.state(),
         }  # fmt: skip
+        if self._associator is not None:
+            state |= {
+                "doubtful": self.doubtful, "new_aliases": list(self._new_aliases), "own": self._own_map.state(),
+            }  # fmt: skip
+        if self._has_names:
+            state["signatures"] = list(self._names.signatures)
         if self._single:
             return state
         return {
-            **state, "signatures": list(self._names.signatures), "log": self._log.state(),
+            **state, "log": self._log.state(),
             "closed": [each.state() for each in self._closed],
             "looked_at": [each.state() for each in self._looked_at],
             "totals": [pack_delta(total.delta()) for total in self.totals],
-            "doubtful": self.doubtful, "new_aliases": list(self._new_aliases), "own": self._own_map.state(),
             "ends": np.array(self.ends).tobytes(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on where `state` was taken, to the bit. Raises ValueError where it is not the state of a filter."""
-        if not self._single:
+        if self._has_names:
             self._names.add(list(state["signatures"]))
         self.filter.restore(state["filter"])
         self.steps, self._opened = state["steps"], state["opened"]
         self._assigned = [np.frombuffer(state["assigned"], np.int64).copy()]
         if self._associator is not None:
             self._associator.restore(state["associator"])
+            self.doubtful = state["doubtful"]
+            self._new_aliases = [(a, b, added) for a, b, added in state["new_aliases"]]
+            self._own_map.restore(state["own"])
         if self._single:
             return
         self._localised = self.steps - self.settings.localise_steps
@@ -443,9 +488,6 @@ class FramedFilter:
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
-        self.doubtful = state["doubtful"]
-        self._new_aliases = [(a, b, added) for a, b, added in state["new_aliases"]]
-        self._own_map.restore(state["own"])
         self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
 
     def _share_keys(self) -> None:

@@ -71,6 +71,20 @@ def own_duplicates(local: LocalMap, together: Callable[[int, int], bool], rules:
     return Duplicates(pairs, len(unclear) / len(keys))
 
 
+def crowded(local: LocalMap, together: Callable[[int, int], bool]) -> float:
+    """Share of a map's landmarks that lie where hardly two can, by place alone, whatever covariances say.
+
+    Nearer to one that they were never sighted together with than half the usual distance to the second nearest.
+    """
+    accepted = np.flatnonzero(local.keys >= 0)
+    mean, keys = local.landmarks[accepted], local.keys[accepted]
+    if len(keys) < 3:
+        return 0.0
+    close = scipy.spatial.KDTree(mean).query_pairs(0.5 * float(np.median(nearest_m(mean, 2))), output_type="ndarray")
+    found = {key for a, b in keys[close].tolist() if not together(a, b) for key in (a, b)}
+    return len(found) / len(keys)
+
+
 def _differences(P: Floats, rows: Ints) -> Floats:
     """Covariance of each difference of two points, whose first rows are rows (m, 2): shape (m, 2, 2)."""
     a, b = (rows[:, side, None] + np.arange(2) for side in range(2))

@@ -15,7 +15,7 @@ from fleet_seif.information import FrameDelta
 from fleet_seif.jit import one_thread
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes
 from fleet_seif.local_map import LocalMap, seen_from
-from fleet_seif.records import UNKNOWN_SIGNATURE, Ints
+from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints
 
 TRAVEL_LEAST: Final = 0.25
 """Share of the reach of its sightings that a vehicle may always travel within a frame."""
@@ -43,8 +43,7 @@ class OwnMap:
     def around(self, most: int, reach_m: float) -> tuple[LocalMap, float]:
         """The landmarks around the end of the last frame, as seen from there, and how far they are all there are.
 
-        At most so many, the nearest; reach_m: of the vehicle's sightings, which must find what they may be of.
-        Raises NumericalError where the frames cannot be solved.
+        At most so many, as `nearest` has it. Raises NumericalError where the frames cannot be solved.
         """
         last = max((int(delta.variables[-1]) for delta in self.frames if len(delta.variables)), default=0)
         life = Life(
@@ -56,11 +55,7 @@ class OwnMap:
         self.misfit = float(solution.chi_square.sum() / max(int(solution.dof.sum()), 1))
         newest = [k for _, _, k in solution.poses].index(-1)
         pose, landmarks = solution.pose_mean[newest], solution.landmark_mean
-        away = np.hypot(*(landmarks - pose[:2]).T)
-        order = np.argsort(away, kind="stable")
-        chosen, travel_max_m = np.sort(order[:most]), np.inf
-        if len(order) > most:
-            travel_max_m = max(float(away[order[most]]) - reach_m, TRAVEL_LEAST * reach_m)
+        chosen, travel_max_m = nearest(landmarks, pose, most, reach_m)
         P = self._solver.joint_covariance(solution, chosen, np.array([newest]))
         numbers = np.array([names[0].number for names in solution.classes], np.int64)
         return seen_from(pose, landmarks[chosen], P, numbers[chosen]), travel_max_m
@@ -102,6 +97,21 @@ class OwnMap:
         self.frames = [read_delta(data) for data in frames]
         self.aliases = [(a, b) for a, b in aliases]
         self._landmarks, self._poses = np.frombuffer(landmarks).reshape(-1, 2), np.frombuffer(poses).reshape(-1, 3)
+
+
+def nearest(landmarks: Floats, pose: Floats, most: int, reach_m: float) -> tuple[Ints, float]:
+    """At most so many landmarks, those nearest to the pose, and how far from there they are all there are, m.
+
+    Args:
+        landmarks (n, 2), pose (3,): m and rad.
+        reach_m: of the vehicle's sightings, which must find what they may be of.
+    """
+    away = np.hypot(*(landmarks - pose[:2]).T)
+    order = np.argsort(away, kind="stable")
+    travel_max_m = np.inf
+    if len(order) > most:
+        travel_max_m = max(float(away[order[most]]) - reach_m, TRAVEL_LEAST * reach_m)
+    return np.sort(order[:most]), travel_max_m
 
 
 def first_names(aliases: Sequence[tuple[int, int]], count: int) -> Ints:

@@ -22,14 +22,13 @@ from fleet_seif import seif_step as kernels
 from fleet_seif.association import associate
 from fleet_seif.association_guards import Verdict
 from fleet_seif.associator import REACH_SIGMAS
-from fleet_seif.config import AssociationSettings
+from fleet_seif.config import AssociationSettings, FilterSettings
 from fleet_seif.consistent import Bools
 from fleet_seif.jit import one_thread
 from fleet_seif.local_map import LocalMap, expected, moved
 from fleet_seif.records import Floats, Ints, Reading
 from fleet_seif.seif import Seif
 from scenarios.chaos_runs import seed_range
-from scenarios.experiments.measures import seif
 from scenarios.experiments.worlds import World, paper_world
 
 EVERY_STEPS = 10
@@ -111,7 +110,7 @@ def decide(
 def compared(active_max: int, worlds: Sequence[World]) -> Found:
     found = Found()
     for world in worlds:
-        filter = Seif(seif(active_max).settings, world.model)
+        filter = Seif(FilterSettings(frames="single", active_max=active_max), world.model)
         filter.start(world.log.sightings_at(0))
         for k, reading in enumerate(world.log.readings()):
             if k % EVERY_STEPS == 0:
