@@ -132,7 +132,7 @@ def line(of: Found) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", default="1..5", type=seed_range)
-    parser.add_argument("--landmarks", nargs="+", type=int, default=[50, 200, 500], metavar="N")
+    parser.add_argument("--landmarks", nargs="+", type=int, default=[50, 200], metavar="N")
     parser.add_argument("--active", nargs="+", type=int, default=[6, 10], metavar="N")
     asked = parser.parse_args()
     for landmarks, active_max, mild in itertools.product(asked.landmarks, asked.active, (False, True)):
