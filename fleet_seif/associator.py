@@ -38,7 +38,7 @@ from fleet_seif.local_map import (
     with_new,
 )
 from fleet_seif.models import COMPASS_XY
-from fleet_seif.own_duplicates import Duplicates, own_duplicates, spacing_m
+from fleet_seif.own_duplicates import Duplicates, crowded, own_duplicates, spacing_m
 from fleet_seif.records import Bools, Floats, Ints
 from fleet_seif.seif import FAULTS
 from fleet_seif.seif_step import check_reading
@@ -171,7 +171,11 @@ class Associator:
     @one_thread
     def duplicates(self) -> Duplicates:
         """Landmarks that have been begun twice (rule 3): pairs of keys."""
-        return own_duplicates(self.local, self._met(self.local.keys[self.local.keys >= 0]))
+        return own_duplicates(self.local, self._met_now())
+
+    def _met_now(self) -> Ints:
+        """See `_met`: of all accepted landmarks."""
+        return self._met(self.local.keys[self.local.keys >= 0])
 
     def _met(self, keys: Ints) -> Ints:
         """From how many poses each two of these landmarks have been sighted, shape (k, k)."""
@@ -181,6 +185,10 @@ class Associator:
                 if b in at:
                     met[i, at[b]] = met[at[b], i] = count
         return met
+
+    def crowded(self) -> float:
+        """Share of landmarks that lie where hardly two can (own_duplicates)."""
+        return crowded(self.local, self._met_now())
 
     @one_thread
     def begin(self, near: LocalMap, travel_max_m: float, barred: Iterable[int] = ()) -> None:

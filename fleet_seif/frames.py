@@ -14,6 +14,10 @@
    be another one, or the frames do not fit each other, the vehicle has probably taken some for their neighbours: it is
    doubtful until a frame closes after which neither is so. Or until it finds a way back: what the sightings of the
    last frames are of is told anew (way_back), and where that looks right these frames are corrected.
+8. With frames = "single" what lies around the pose comes from the one filter itself, every frame_steps_max steps
+   (surroundings), and only the sighting that has a landmark accepted, and later ones, enter the filter: earlier ones
+   would have to be worked into poses that are gone. Landmarks begun twice become aliases, and the filter holds them
+   together (seif_join).
 """
 
 import dataclasses
@@ -38,6 +42,7 @@ from fleet_seif.models import RANGE_BEARING
 from fleet_seif.own_map import OwnMap, first_names
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 from fleet_seif.seif import Seif, Taken
+from fleet_seif.surroundings import around_pose
 from fleet_seif.way_back import ToldAnew, told_anew
 
 log = logging.getLogger(__name__)
@@ -55,6 +60,9 @@ CORRECTIONS_EACH = 16
 """Frames that are corrected with one step, on the way back from doubt."""
 FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
+
+CROWDED_MAX = 0.15
+"""A vehicle of a single frame is doubtful while a larger share of the landmarks around are crowded (own_duplicates)."""
 
 
 def _told(seen: Sightings, decision: Decision | None) -> Sightings:
@@ -80,6 +88,7 @@ class FramedFilter:
         self._localised, self._asked = 0, (0, np.zeros(3))
         self._names = Names()
         self._single = settings.frames == "single"
+        self._has_names = not self._single or settings.identities == "associated"
         self._frame_settings = settings
         if not self._single:
             most = min(settings.landmarks_max, FRAME_LANDMARKS_MAX)
@@ -99,7 +108,7 @@ class FramedFilter:
 
     def _open(self) -> None:
         """Begin a frame; it is published with its first step."""
-        self.filter = Seif(self._frame_settings, self.model, None if self._single else self._names)
+        self.filter = Seif(self._frame_settings, self.model, self._names if self._has_names else None)
         self._log = FrameLog()
         self._opened = False
 
@@ -142,7 +151,9 @@ class FramedFilter:
     def landmarks(self) -> Floats:
         """Live landmarks in the coordinates of frame 0, m, shape (n, 2), by number; NaN for one that is none."""
         if self._single:
-            return self.filter.landmarks
+            landmarks = self.filter.landmarks
+            landmarks[first_names(self._own_map.aliases, len(landmarks)) != np.arange(len(landmarks))] = np.nan
+            return landmarks
         found = np.full((len(self.signatures), 2), np.nan)
         found[: len(self._map)] = self._map
         own = self.filter.called
@@ -228,6 +239,8 @@ class FramedFilter:
             result, taken = self._take_decision(decision, result, seen)
         self._assigned.append(taken[4])
         if self._single:
+            if self._is_round_over():
+                result = dataclasses.replace(result, delta=self._look_around_pose(result.delta))
             return result, (FramePart(frame=frame, status=status, delta=result.delta),)
         self._log.add(moves, taken, self.filter.pose)
         if not self._is_over():
@@ -308,8 +321,6 @@ class FramedFilter:
             local = associator.local
             near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
         associator.begin(*near)
-        while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
-            self._late += self._looked_at_again(self._looked_at.pop(0))
         if not self._looks_wrong(duplicates.unclear, own):
             self._doubtful_since = None
         else:
@@ -317,6 +328,8 @@ class FramedFilter:
                 self._doubtful_since = closed.frame
             self._find_way_back(closed.frame, self._doubtful_since, associator)
         self._note_aliases(before)
+        while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
+            self._late += self._looked_at_again(self._looked_at.pop(0))
 
     def _looks_wrong(self, unclear: float, own: OwnMap) -> bool:
         limits = self.settings.association
@@ -386,6 +399,30 @@ class FramedFilter:
         taken, self._begun = tuple(self._begun), []
         return taken
 
+    def _is_round_over(self) -> bool:
+        """Whether what lies around a vehicle of a single frame is to be looked at anew."""
+        associator, every = self._associator, self.settings.frame_steps_max
+        return associator is not None and (self.steps % every == 0 or associator.has_left(associator.local.pose))
+
+    def _look_around_pose(self, step: FrameDelta) -> FrameDelta:
+        """Rule 8, after a step with this delta; what is published instead of it."""
+        associator, limits = self._associator, self.settings.association
+        assert associator is not None
+        duplicates, before = associator.duplicates(), set(self._own_map.aliases)
+        self._own_map.join(duplicates.pairs)
+        self._note_aliases(before)
+        first = np.unique(first_names(self._own_map.aliases, len(self._names.signatures)))
+        try:
+            step = self.filter.join(duplicates.pairs, step)
+            near = around_pose(self.filter, first, limits.local_landmarks_max, associator.reach_m)
+        except NumericalError as error:
+            log.warning("not_looked_around step=%d reason=%s", self.steps, error)
+            near = begun_at(kept(associator.local, np.flatnonzero(associator.local.keys >= 0))), associator.travel_max_m
+        associator.begin(*near)
+        doubtful = duplicates.unclear > limits.unclear_max or associator.crowded() > CROWDED_MAX
+        self._doubtful_since = self.frame if doubtful else None
+        return step
+
     def take_aliases(self) -> tuple[tuple[int, int, bool], ...]:
         """Pairs of landmarks that have become one, or are not any more, since the last call: to be published."""
         taken, self._new_aliases = tuple(self._new_aliases), []
@@ -431,9 +468,11 @@ class FramedFilter:
         """Close the open frame and correct all that is outstanding."""
         parts: list[FramePart] = []
         if self._opened:
-            frame, nothing = self.frame, FrameDelta.nothing()
+            frame, last = self.frame, FrameDelta.nothing()
+            if self._single and self._associator is not None:
+                last = self._look_around_pose(last)
             end_pose = self.filter.pose if self._single else self._close()
-            parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=nothing, end_pose=end_pose))
+            parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=last, end_pose=end_pose))
         for closed in self._closed:
             parts += self._corrected(closed)
         for closed in self._looked_at:
@@ -452,15 +491,18 @@ class FramedFilter:
             "filter": self.filter.state(), "steps": self.steps, "opened": self._opened, "assigned": assigned.tobytes(),
             "associator": self._associator and self._associator.state(),
         }  # fmt: skip
+        if self._associator is not None:
+            state |= {"doubtful_since": self._doubtful_since, "own": self._own_map.state()}
+        if self._has_names:
+            state["signatures"] = list(self._names.signatures)
         if self._single:
             return state
         return {
-            **state, "signatures": list(self._names.signatures), "log": self._log.state(),
+            **state, "log": self._log.state(),
             "kept": [each.state() for each in self._kept],
             "closed": [each.frame for each in self._closed],
             "looked_at": [each.frame for each in self._looked_at],
             "totals": [pack_delta(total.delta()) for total in self.totals],
-            "doubtful_since": self._doubtful_since, "own": self._own_map.state(),
             "to_correct": [
                 (frame, pack_delta(whole), end.tobytes()) for frame, (whole, end) in self._to_correct.items()
             ],
@@ -469,13 +511,15 @@ class FramedFilter:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on where `state` was taken, to the bit. Raises ValueError where it is not the state of a filter."""
-        if not self._single:
+        if self._has_names:
             self._names.add(list(state["signatures"]))
         self.filter.restore(state["filter"])
         self.steps, self._opened = state["steps"], state["opened"]
         self._assigned = [np.frombuffer(state["assigned"], np.int64).copy()]
         if self._associator is not None:
             self._associator.restore(state["associator"])
+            self._doubtful_since = state["doubtful_since"]
+            self._own_map.restore(state["own"])
         if self._single:
             return
         self._localised = self.steps - self.settings.localise_steps
@@ -488,9 +532,7 @@ class FramedFilter:
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
-        self._doubtful_since = state["doubtful_since"]
         self._to_correct = {frame: (read_delta(whole), np.frombuffer(end)) for frame, whole, end in state["to_correct"]}
-        self._own_map.restore(state["own"])
         self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
 
     def _share_keys(self) -> None:

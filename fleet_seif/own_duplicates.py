@@ -91,6 +91,22 @@ def own_duplicates(local: LocalMap, met: Ints, rules: MergeRules = RULES) -> Dup
     return Duplicates(pairs, len(unclear) / len(keys))
 
 
+def crowded(local: LocalMap, met: Ints) -> float:
+    """Share of a map's landmarks that lie where hardly two can, by place alone, whatever covariances say.
+
+    Nearer to one that they were never sighted together with than half the usual distance to the second nearest.
+
+    Args:
+        met: as in `own_duplicates`.
+    """
+    mean = local.landmarks[local.keys >= 0]
+    if len(mean) < 3:
+        return 0.0
+    close = scipy.spatial.KDTree(mean).query_pairs(0.5 * float(np.median(nearest_m(mean, 2))), output_type="ndarray")
+    found = close[met[close[:, 0], close[:, 1]] < TOGETHER_LEAST]
+    return len(np.unique(found)) / len(mean)
+
+
 def _differences(P: Floats, rows: Ints) -> Floats:
     """Covariance of each difference of two points, whose first rows are rows (m, 2): shape (m, 2, 2)."""
     a, b = (rows[:, side, None] + np.arange(2) for side in range(2))

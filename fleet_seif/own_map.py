@@ -71,8 +71,7 @@ class OwnMap:
     def around(self, most: int, reach_m: float) -> tuple[LocalMap, float]:
         """The landmarks around the end of the last frame, as seen from there, and how far they are all there are.
 
-        At most so many, the nearest; reach_m: of the vehicle's sightings, which must find what they may be of.
-        Raises NumericalError where the frames cannot be solved.
+        At most so many, as `nearest` has it. Raises NumericalError where the frames cannot be solved.
         """
         numbers = [int(delta.variables[-1]) for delta in self.frames if len(delta.variables)]
         count = max([0, *numbers, *(other + 1 for _, other in self.aliases)])
@@ -85,11 +84,7 @@ class OwnMap:
         self.misfit = float(self._fit[:, 0].sum() / max(int(self._fit[:, 1].sum()), 1))
         newest = [k for _, _, k in solution.poses].index(-1)
         pose, landmarks = solution.pose_mean[newest], solution.landmark_mean
-        away = np.hypot(*(landmarks - pose[:2]).T)
-        order = np.argsort(away, kind="stable")
-        chosen, travel_max_m = np.sort(order[:most]), np.inf
-        if len(order) > most:
-            travel_max_m = max(float(away[order[most]]) - reach_m, TRAVEL_LEAST * reach_m)
+        chosen, travel_max_m = nearest(landmarks, pose, most, reach_m)
         P = self._solver.joint_covariance(solution, chosen, np.array([newest]))
         return seen_from(pose, landmarks[chosen], P, self._keys(solution)[chosen]), travel_max_m
 
@@ -163,6 +158,21 @@ class OwnMap:
         self._views, self._changed = [None] * len(frames), set(changed)
         self._landmarks, self._poses = np.frombuffer(landmarks).reshape(-1, 2), np.frombuffer(poses).reshape(-1, 3)
         self._fit = np.frombuffer(fit).reshape(-1, 3)
+
+
+def nearest(landmarks: Floats, pose: Floats, most: int, reach_m: float) -> tuple[Ints, float]:
+    """At most so many landmarks, those nearest to the pose, and how far from there they are all there are, m.
+
+    Args:
+        landmarks (n, 2), pose (3,): m and rad.
+        reach_m: of the vehicle's sightings, which must find what they may be of.
+    """
+    away = np.hypot(*(landmarks - pose[:2]).T)
+    order = np.argsort(away, kind="stable")
+    travel_max_m = np.inf
+    if len(order) > most:
+        travel_max_m = max(float(away[order[most]]) - reach_m, TRAVEL_LEAST * reach_m)
+    return np.sort(order[:most]), travel_max_m
 
 
 def first_names(aliases: Sequence[tuple[int, int]], count: int) -> Ints:

@@ -19,7 +19,7 @@ from fleet_seif.errors import NumericalError
 from fleet_seif.frame_log import FrameLog
 from fleet_seif.information import FrameDelta
 from fleet_seif.local_map import nothing_known
-from fleet_seif.own_map import OwnMap
+from fleet_seif.own_map import OwnMap, first_names
 from fleet_seif.records import Floats, Sightings
 
 
@@ -49,7 +49,7 @@ def told_anew(
     solved: list[tuple[FrameDelta, Floats]] = []
     unclear = 0.0
     try:
-        _look_around(anew, own, known)
+        _look_around(anew, own, known, most)
         for frame in frames:
             none = np.empty(0, np.int64)
             again.append(
@@ -70,20 +70,20 @@ def told_anew(
                 return None
             solved.append(found)
             unclear = duplicates.unclear
-            _look_around(anew, own, known if frame is not frames[-1] else 0)
+            _look_around(anew, own, known if frame is not frames[-1] else 0, most)
     except NumericalError:
         return None
     return ToldAnew(again, solved, own, anew, most, unclear)
 
 
-def _look_around(associator: Associator, own: OwnMap, known: int) -> None:
-    """Begin a frame. Landmarks below `known` are barred, but for those that have been begun anew."""
+def _look_around(associator: Associator, own: OwnMap, known: int, most: int) -> None:
+    """Begin a frame. Of `most` landmarks those below `known` are barred, but for those that have been begun anew."""
     if not own.frames:
         associator.begin(nothing_known(), np.inf)
         return
     near, travel_max_m = own.around(associator.settings.local_landmarks_max, associator.reach_m)
-    met = {one for one, other in own.aliases if other >= known}
-    barred = [key for key in near.keys.tolist() if key < known and key not in met]
+    anew = first_names(own.aliases, most)[known:]
+    barred = near.keys[~np.isin(near.keys, anew)].tolist()
     associator.begin(near, travel_max_m, barred)
 
 
