@@ -19,16 +19,11 @@ from scenarios.config import load_scenario
 from scenarios.recording import Log
 from scenarios.source import record
 from tests.drives import FLEET, put
+from tests.identities import HALFWAY
 from tests.test_frames_associated import restarted, stored, told
 from vehicles.core import Identity, VehicleCore
 
 SETTINGS = FilterSettings(identities="associated")
-NOISE = (
-    "noise.forward_std_m=0.007",
-    "noise.turn_std_rad=0.055",
-    "noise.range_std_m=0.02",
-    "noise.bearing_std_rad=0.033",
-)
 LOST, BACK = 125, 150
 """When the frames close after which the vehicle of `slipped` is doubtful, and after which it has found its way back."""
 
@@ -36,7 +31,7 @@ LOST, BACK = 125, 150
 @cache
 def slipped() -> Log:
     """Noise half way to the paper's, with which some vehicles take landmarks for their neighbours."""
-    return record(load_scenario("three_air_vehicles_unknown", ("world.steps=220", *NOISE), 1), "v1").logs["v1"]
+    return record(load_scenario("three_air_vehicles_unknown", ("world.steps=220", *HALFWAY), 1), "v1").logs["v1"]
 
 
 def flown(framed: FramedFilter) -> list[tuple[tuple[FramePart, ...], bool]]:
@@ -92,7 +87,7 @@ def test_where_it_takes_several_messages_it_is_doubtful_until_the_last(monkeypat
     monkeypatch.setattr(frames_module, "CORRECTIONS_EACH", 2)
     said = flown(little)
     parts = [corrected(said[step][0]) for step in range(BACK, BACK + 3)]
-    assert sorted(sum(parts, [])) == list(range(6))
+    assert sorted(frame for some in parts for frame in some) == list(range(6))
     assert all(parts)
     assert [said[step][1] for step in range(BACK, BACK + 4)] == [True, True, False, False]
     assert stored(little) == stored(whole)
