@@ -12,8 +12,8 @@
 6. A function of this vehicle's own readings and settings alone.
 """
 
-import itertools
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -29,7 +29,7 @@ from fleet_seif.local_map import (
     LocalMap,
     begun_at,
     expected,
-    from_pose_std,
+    from_pose_stds,
     in_reach,
     kept,
     moved,
@@ -38,8 +38,8 @@ from fleet_seif.local_map import (
     with_new,
 )
 from fleet_seif.models import COMPASS_XY
-from fleet_seif.own_duplicates import Duplicates, own_duplicates
-from fleet_seif.records import Floats, Ints
+from fleet_seif.own_duplicates import Duplicates, crowded, own_duplicates, spacing_m
+from fleet_seif.records import Bools, Floats, Ints
 from fleet_seif.seif import FAULTS
 from fleet_seif.seif_step import check_reading
 
@@ -47,10 +47,9 @@ DOUBTFUL_SIGMAS: Final = 3.0
 """A landmark is told from its neighbour where so many standard deviations reach at most half way to it."""
 LIFETIMES: Final = 10
 """A provisional landmark out of reach is kept for so many times `confirm_steps`."""
-TOGETHER_LEAST: Final = 2
-"""Poses from which two landmarks must have been sighted to be two: once may be clutter."""
 REACH_SIGMAS: Final = 4.0
 """How far beyond what was measured a landmark may be, in standard deviations, to be compared at all."""
+NOBODY: Final[Counter[int]] = Counter()
 
 
 @dataclass(frozen=True)
@@ -90,13 +89,17 @@ class Associator:
         self.travel_max_m = np.inf
         self.reach_m = 0.0
         self._provisional: dict[int, Provisional] = {}
-        self._last: dict[int, int] = {}
         self._next = NONE - 1
-        self._began = -1
-        self._together: Counter[tuple[int, int]] = Counter()
+        self._together: dict[int, Counter[int]] = {}
         self._apart: dict[int, float] = {}
 
-    @one_thread
+    def anew(self) -> "Associator":
+        """One that has met what this one has, and knows of no provisional landmark."""
+        other = Associator(self.settings, self.model)
+        other.reach_m, other._next = self.reach_m, self._next
+        other._together = {key: met.copy() for key, met in self._together.items()}
+        return other
+
     def decide(self, step: int, motion: tuple[Floats, Floats] | None, z: Floats, Z: Floats, known: int) -> Decision:
         """Raises ReadingRefused where a number or a covariance is none, NumericalError where the local map cannot be.
 
@@ -106,7 +109,7 @@ class Associator:
         _check(self.model, motion, z, Z)
         local = self.local if motion is None else moved(self.model, self.local, *motion)
         near = in_reach(local.mean, local.P, _reach(self.model, z, Z), REACH_SIGMAS)
-        near = near[[not self._is_doubtful(local, i, step) for i in near.tolist()]]
+        near = near[~self._are_doubtful(local, near)]
         found = associate(z, Z, *expected(self.model, local.mean, local.P, near), self.settings, model=self.model)
         paired = np.flatnonzero(found.assignment >= 0)
         which = near[found.assignment[paired]]
@@ -118,20 +121,20 @@ class Associator:
             local = with_new(self.model, local, key, z[i], Z[i])
             keys[i], provisional[key] = key, Provisional(step, 0, 0)
             key -= 1
-        within = set(local.keys[in_reach(local.mean, local.P, self.reach_m, 0.0)].tolist())
+        seen, within = set(keys.tolist()), set[int]()
+        if provisional:
+            within = set(local.keys[in_reach(local.mean, local.P, self.reach_m, 0.0)].tolist())
         for each, known_of in provisional.items():
-            seen = each in keys
+            sighted_now = each in seen
             provisional[each] = Provisional(
-                known_of.born, known_of.sightings + seen, known_of.chances + (seen or each in within)
+                known_of.born, known_of.sightings + sighted_now, known_of.chances + (sighted_now or each in within)
             )
         return self._settled(step, known, Decision(keys, {}, squared, 2 * len(paired), local, provisional, key))
 
-    def _is_doubtful(self, local: LocalMap, i: int, step: int) -> bool:
-        """Rule 3, of the landmark at position i."""
-        key = int(local.keys[i])
-        if key < 0 or self._last.get(key, step) > self._began:
-            return False
-        return 2.0 * DOUBTFUL_SIGMAS * from_pose_std(local.P, i) > self._apart.get(key, np.inf)
+    def _are_doubtful(self, local: LocalMap, which: Ints) -> Bools:
+        """Rule 3, of landmarks at these positions: a mask."""
+        apart = np.array([self._apart.get(key, np.inf) for key in local.keys[which].tolist()])
+        return np.asarray(2.0 * DOUBTFUL_SIGMAS * from_pose_stds(local.P, which) > apart)
 
     def _settled(self, step: int, known: int, made: Decision) -> Decision:
         """Provisional landmarks that are accepted now, and those that are forgotten."""
@@ -147,18 +150,17 @@ class Associator:
             del made.provisional[key]
         local = made.local
         if accepted or gone:
-            names = np.array([accepted.get(key, key) for key in local.keys.tolist()], np.int64)
-            local = LocalMap(local.mean, local.P, names)
-            local = kept(local, np.flatnonzero(~np.isin(names, list(gone)))) if gone else local
-        keys = np.array([accepted.get(key, key) for key in made.keys.tolist()], np.int64)
-        return replace(made, keys=keys, local=local)
+            local = LocalMap(local.mean, local.P, _renamed(local.keys, accepted))
+            local = kept(local, np.flatnonzero(~np.isin(local.keys, list(gone)))) if gone else local
+        return replace(made, keys=_renamed(made.keys, accepted), local=local)
 
-    def take(self, step: int, decision: Decision, z: Floats) -> None:
+    def take(self, decision: Decision, z: Floats) -> None:
         """The step has been taken."""
         self.local, self._provisional, self._next = decision.local, decision.provisional, decision.next
         seen = sorted(key for key in decision.keys.tolist() if key >= 0)
-        self._together.update(itertools.combinations(seen, 2))
-        self._last.update((key, step) for key in decision.keys.tolist() if key >= 0)
+        for i, key in enumerate(seen):
+            self._together.setdefault(key, Counter()).update(seen[i + 1 :])
+            self._apart.pop(key, None)
         if len(z):
             self.reach_m = max(self.reach_m, float(_distances(self.model, z).max()))
 
@@ -169,40 +171,43 @@ class Associator:
     @one_thread
     def duplicates(self) -> Duplicates:
         """Landmarks that have been begun twice (rule 3): pairs of keys."""
-        return own_duplicates(self.local, lambda a, b: self._together[min(a, b), max(a, b)] >= TOGETHER_LEAST)
+        return own_duplicates(self.local, self._met_now())
+
+    def _met_now(self) -> Ints:
+        """See `_met`: of all accepted landmarks."""
+        return self._met(self.local.keys[self.local.keys >= 0])
+
+    def _met(self, keys: Ints) -> Ints:
+        """From how many poses each two of these landmarks have been sighted, shape (k, k)."""
+        met, at = np.zeros((len(keys), len(keys)), np.int64), {key: i for i, key in enumerate(keys.tolist())}
+        for a, i in at.items():
+            for b, count in self._together.get(a, NOBODY).items():
+                if b in at:
+                    met[i, at[b]] = met[at[b], i] = count
+        return met
+
+    def crowded(self) -> float:
+        """Share of landmarks that lie where hardly two can (own_duplicates)."""
+        return crowded(self.local, self._met_now())
 
     @one_thread
-    def begin(self, step: int, near: LocalMap, travel_max_m: float) -> None:
-        """A frame begins after this step: with these landmarks, as seen from there, and the provisional ones."""
-        self._began = step
-        carried = np.flatnonzero(self.local.keys < NONE)
-        self._apart = self._spacing(near)
-        self.local, self.travel_max_m = beside(near, begun_at(kept(self.local, carried))), travel_max_m
+    def begin(self, near: LocalMap, travel_max_m: float, barred: Iterable[int] = ()) -> None:
+        """A frame begins here: with these landmarks, as seen from its start, and the provisional ones.
 
-    def _spacing(self, near: LocalMap) -> dict[int, float]:
-        """How far each landmark is at most from its nearest neighbour, m: the neighbour may not have been sighted yet.
-
-        Only landmarks that were sighted together count: others may be one.
+        barred: those that are not compared with sightings, however well their places are known.
         """
-        keys, places = near.keys.tolist(), near.landmarks
-        away = np.linalg.norm(places[:, None] - places[None], axis=2)
-        met = np.zeros_like(away, bool)
-        at = {key: i for i, key in enumerate(keys)}
-        for a, b in self._together:
-            if a in at and b in at:
-                met[at[a], at[b]] = met[at[b], at[a]] = True
-        nearest = np.where(met, away, np.inf).min(axis=1, initial=np.inf)
-        usual = np.median(nearest[np.isfinite(nearest)]) if np.any(met) else np.inf
-        return dict(zip(keys, np.minimum(nearest, usual).tolist(), strict=True))
+        carried = np.flatnonzero(self.local.keys < NONE)
+        spacing = spacing_m(near.landmarks, self._met(near.keys)).tolist()
+        self._apart = dict(zip(near.keys.tolist(), spacing, strict=True)) | dict.fromkeys(barred, 0.0)
+        self.local, self.travel_max_m = beside(near, begun_at(kept(self.local, carried))), travel_max_m
 
     def state(self) -> dict[str, Any]:
         """Plain values for msgpack; `restore` takes them back."""
         local = self.local
         return {
             "mean": local.mean.tobytes(), "P": local.P.tobytes(), "keys": local.keys.tobytes(), "next": self._next,
-            "began": self._began, "travel": self.travel_max_m, "reach": self.reach_m,
-            "last": list(self._last.items()), "together": [(*pair, count) for pair, count in self._together.items()],
-            "apart": list(self._apart.items()),
+            "travel": self.travel_max_m, "reach": self.reach_m, "apart": list(self._apart.items()),
+            "together": [(key, list(others.items())) for key, others in self._together.items()],
             "provisional": [(key, each.born, each.sightings, each.chances) for key, each in self._provisional.items()],
         }  # fmt: skip
 
@@ -212,10 +217,14 @@ class Associator:
         P = np.frombuffer(state["P"]).reshape(len(mean), len(mean)).copy()
         self.local = LocalMap(mean, P, np.frombuffer(state["keys"], np.int64).copy())
         self.travel_max_m, self.reach_m, self._next = state["travel"], state["reach"], state["next"]
-        self._began = state["began"]
-        self._last, self._apart = dict(state["last"]), dict(state["apart"])
-        self._together = Counter({(a, b): count for a, b, count in state["together"]})
+        self._apart = dict(state["apart"])
+        self._together = {key: Counter(dict(others)) for key, others in state["together"]}
         self._provisional = {key: Provisional(*rest) for key, *rest in state["provisional"]}
+
+
+def _renamed(keys: Ints, names: dict[int, int]) -> Ints:
+    """Keys by the names that some have from now on."""
+    return np.array([names.get(key, key) for key in keys.tolist()], np.int64) if names else keys
 
 
 def beside(a: LocalMap, b: LocalMap) -> LocalMap:

@@ -1,8 +1,8 @@
 """Settings shared by every process: frozen, keyword-only, unknown keys refused, units last in names."""
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from fleet_seif.messages import NAME_MAX
 
@@ -91,7 +91,8 @@ class FilterSettings(Settings):
     localise_steps: steps after which a vehicle of several frames solves them as one system, for its live pose and
     map; in between the open frame's filter goes on alone. Enters nothing that is published.
     identities: "signatures", each sighting says which landmark it is; "associated", the vehicle finds out by where
-    it is, as `association` says, and signatures are not looked at; with frames = "adaptive" only.
+    it is, as `association` says, and signatures are not looked at. In a single frame it then looks around anew every
+    frame_steps_max steps.
     landmarks_max: landmarks of a frame, for which address space is reserved; a frame on the wire takes 32,767.
     neighbours_max: links of a landmark to others; where a step would make more, its sighting is refused. Not for "eif".
     """
@@ -117,15 +118,6 @@ class FilterSettings(Settings):
     close_lag_steps: int = Field(default_factory=_close_lag_steps, ge=1, le=10_000)
     landmarks_max: Annotated[int, Field(ge=1, le=10_000_000)] = 32_767
     neighbours_max: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
-
-    @model_validator(mode="after")
-    def _landmarks_are_told_apart_within_frames(self) -> Self:
-        if self.identities == "associated" and self.frames == "single":
-            raise ValueError(
-                'identities = "associated" does not go with frames = "single": sightings are compared with what the'
-                ' closed frames know; remedy: frames = "adaptive"'
-            )
-        return self
 
 
 class PublishSettings(Settings):

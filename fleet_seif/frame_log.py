@@ -56,12 +56,14 @@ class FrameLog:
     """The readings of one frame, and the live estimate after each: what its batch is made from.
 
     motions: odometry, its covariance, and the pose after it. sightings: the number of motions before, signatures, z and
-    their covariances. A signature below 0 is nobody's, or not yet.
+    their covariances. A signature below 0 is nobody's, or not yet. _provisional: of a signature below NONE, which
+    of `sightings` brought it.
     """
 
     motions: list[tuple[Floats, Floats, Floats]] = field(default_factory=list)
     sightings: list[tuple[int, Ints, Floats, Floats]] = field(default_factory=list)
     heading_variance: float = 0.0
+    _provisional: dict[int, list[int]] = field(default_factory=dict)
 
     def add(self, moves: bool, taken: Taken, pose: Floats) -> None:
         """One step: the motion (none before any), and what was seen. The arrays are kept."""
@@ -70,14 +72,25 @@ class FrameLog:
             self.motions.append((u, cov, pose))
             self.heading_variance += float(cov[2, 2])
         if len(signature):
-            self.sightings.append((len(self.motions), signature, z, Z))
+            self._keep(len(self.motions), signature, z, Z)
 
-    def rename(self, old: int, new: int, least: int = 1) -> None:
-        """Sightings of one signature have another from now on; where there are fewer than `least`, none."""
-        found = [(names, names == old) for _, names, _, _ in self.sightings if old in names]
-        few = sum(int(np.count_nonzero(same)) for _, same in found) < least
-        for names, same in found:
-            names[same] = NONE if few else new
+    def _keep(self, step: int, signature: Ints, z: Floats, Z: Floats) -> None:
+        for name in signature[signature < NONE].tolist():
+            self._provisional.setdefault(name, []).append(len(self.sightings))
+        self.sightings.append((step, signature, z, Z))
+
+    def accept(self, old: int, new: int, least: int = 1) -> None:
+        """Sightings of a signature below NONE have another from now on; where there are fewer than `least`, none."""
+        found = [self.sightings[i][1] for i in self._provisional.pop(old, [])]
+        few = sum(int(np.count_nonzero(names == old)) for names in found) < least
+        for names in found:
+            names[names == old] = NONE if few else new
+
+    def rename(self, names: Ints) -> None:
+        """Sightings of landmark n are of names[n] from now on."""
+        for _, signature, _, _ in self.sightings:
+            known = signature >= 0
+            signature[known] = names[signature[known]]
 
     def decided_again(self, model: int, poses: Floats, signatures: Ints, landmarks: Floats) -> bool:
         """Tell once more what sightings are of, now that the whole frame is known. Returns whether anything changed.
@@ -131,14 +144,11 @@ class FrameLog:
     @staticmethod
     def restored(state: tuple[Any, ...]) -> "FrameLog":
         motions, seen, heading_variance = state
-        return FrameLog(
-            motions=[(_read(u, 3), _read(cov, 3, 3), _read(pose, 3)) for u, cov, pose in motions],
-            sightings=[
-                (step, np.frombuffer(names, np.int64).copy(), _read(z, -1, 2), _read(Z, -1, 2, 2))
-                for step, names, z, Z in seen
-            ],
-            heading_variance=heading_variance,
-        )
+        log = FrameLog([(_read(u, 3), _read(cov, 3, 3), _read(pose, 3)) for u, cov, pose in motions])
+        log.heading_variance = heading_variance
+        for step, names, z, Z in seen:
+            log._keep(step, np.frombuffer(names, np.int64).copy(), _read(z, -1, 2), _read(Z, -1, 2, 2))
+        return log
 
     def guesses(self, model: int, signatures: Ints, landmarks: Floats) -> tuple[Ints, Floats]:
         """The landmarks that these sightings are of, (n,) and (n, 2) m: as estimated, or where the first puts it."""

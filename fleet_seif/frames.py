@@ -12,23 +12,26 @@
 7. Where nothing tells which landmark a sighting is of (identities = "associated"), an Associator decides, against what
    the closed frames say about where the open one starts and what lies around it (own_map). Where too many landmarks may
    be another one, or the frames do not fit each other, the vehicle has probably taken some for their neighbours: it is
-   doubtful until a frame closes after which neither is so.
+   doubtful until a frame closes after which neither is so. Or until it finds a way back: what the sightings of the
+   last frames are of is told anew (way_back), and where that looks right these frames are corrected.
+8. With frames = "single" what lies around the pose comes from the one filter itself, every frame_steps_max steps
+   (surroundings), and only the sighting that has a landmark accepted, and later ones, enter the filter: earlier ones
+   would have to be worked into poses that are gone. Landmarks begun twice become aliases, and the filter holds them
+   together (seif_join).
 """
 
 import dataclasses
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from fleet_seif.associator import Associator, Decision
+from fleet_seif.closed_frames import Closed, join
 from fleet_seif.config import FilterSettings
 from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.errors import NumericalError
 from fleet_seif.filters import Names, StepResult, checked_reading
-from fleet_seif.frame_deltas import quantised
 from fleet_seif.frame_log import NONE, FrameLog
 from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
@@ -39,12 +42,27 @@ from fleet_seif.models import RANGE_BEARING
 from fleet_seif.own_map import OwnMap, first_names
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Reading, Sightings
 from fleet_seif.seif import Seif, Taken
+from fleet_seif.surroundings import around_pose
+from fleet_seif.way_back import ToldAnew, told_anew
 
 log = logging.getLogger(__name__)
 AGAIN_FRAMES = 4
 """A frame is looked at again when so many more have closed."""
+KEPT_FRAMES = 16
+"""Closed frames whose readings are kept, while the vehicle is sound; where it is doubtful, those since, too."""
+KEPT_FRAMES_MAX = 64
+"""Closed frames whose readings are kept at most."""
+BACK_UNCLEAR = 0.5
+"""Share of `unclear_max` up to which what was told anew is taken."""
+BACK_MISFIT = 1.1
+"""How many times the misfit before that of what was told anew may be; a misfit below 1 is none."""
+CORRECTIONS_EACH = 16
+"""Frames that are corrected with one step, on the way back from doubt."""
 FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
+
+CROWDED_MAX = 0.15
+"""A vehicle of a single frame is doubtful while a larger share of the landmarks around are crowded (own_duplicates)."""
 
 
 def _told(seen: Sightings, decision: Decision | None) -> Sightings:
@@ -55,38 +73,8 @@ def _told(seen: Sightings, decision: Decision | None) -> Sightings:
     return Sightings(z=np.asarray(seen.z)[told], cov=np.asarray(seen.cov)[told], signature=decision.keys[told])
 
 
-@dataclass
-class Closed:
-    """A frame that has ended and is to be corrected at step `due`.
-
-    landmarks (n, 2): as estimated last; signatures, numbers (n,): theirs, and how they are called in the life.
-    poses (T, 3): as its batch has found them; none before.
-    """
-
-    frame: int
-    due: int
-    log: FrameLog
-    landmarks: Floats
-    signatures: Ints
-    numbers: Ints
-    poses: Floats = field(default_factory=lambda: np.empty((0, 3)))
-
-    def state(self) -> tuple[Any, ...]:
-        """Plain values for msgpack; `restored` takes them back."""
-        arrays = (self.landmarks, self.signatures, self.numbers, self.poses)
-        return (self.frame, self.due, self.log.state(), *(array.tobytes() for array in arrays))
-
-    @staticmethod
-    def restored(state: tuple[Any, ...]) -> "Closed":
-        frame, due, log_, landmarks, signatures, numbers, poses = state
-        return Closed(
-            frame, due, FrameLog.restored(log_), np.frombuffer(landmarks).reshape(-1, 2),
-            np.frombuffer(signatures, np.int64), np.frombuffer(numbers, np.int64), np.frombuffer(poses).reshape(-1, 3),
-        )  # fmt: skip
-
-
 class FramedFilter:
-    """See the rules above. doubtful: when the last frame closed, this vehicle's map did not look right (rule 7)."""
+    """See the rules above."""
 
     def __init__(self, settings: FilterSettings, model: int = RANGE_BEARING) -> None:
         self.settings = settings
@@ -100,25 +88,34 @@ class FramedFilter:
         self._localised, self._asked = 0, (0, np.zeros(3))
         self._names = Names()
         self._single = settings.frames == "single"
+        self._has_names = not self._single or settings.identities == "associated"
         self._frame_settings = settings
         if not self._single:
             most = min(settings.landmarks_max, FRAME_LANDMARKS_MAX)
             self._frame_settings = settings.model_copy(update={"landmarks_max": most})
+        self._kept: list[Closed] = []
         self._closed: list[Closed] = []
         self._looked_at: list[Closed] = []
         self._late: list[FramePart] = []
         self._associator = Associator(settings.association, model) if settings.identities == "associated" else None
         self._own_map = OwnMap()
-        self.doubtful = False
+        self._doubtful_since: int | None = None
+        self._to_correct: dict[int, tuple[FrameDelta, Floats]] = {}
+        self._begun: list[tuple[int, int]] = []
         self._new_aliases: list[tuple[int, int, bool]] = []
         self._assigned: list[Ints] = []
         self._open()
 
     def _open(self) -> None:
         """Begin a frame; it is published with its first step."""
-        self.filter = Seif(self._frame_settings, self.model, None if self._single else self._names)
+        self.filter = Seif(self._frame_settings, self.model, self._names if self._has_names else None)
         self._log = FrameLog()
         self._opened = False
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether this vehicle's map did not look right when the last frame closed (rule 7), or still is corrected."""
+        return self._doubtful_since is not None or bool(self._to_correct)
 
     @property
     def signatures(self) -> list[int]:
@@ -154,7 +151,9 @@ class FramedFilter:
     def landmarks(self) -> Floats:
         """Live landmarks in the coordinates of frame 0, m, shape (n, 2), by number; NaN for one that is none."""
         if self._single:
-            return self.filter.landmarks
+            landmarks = self.filter.landmarks
+            landmarks[first_names(self._own_map.aliases, len(landmarks)) != np.arange(len(landmarks))] = np.nan
+            return landmarks
         found = np.full((len(self.signatures), 2), np.nan)
         found[: len(self._map)] = self._map
         own = self.filter.called
@@ -240,6 +239,8 @@ class FramedFilter:
             result, taken = self._take_decision(decision, result, seen)
         self._assigned.append(taken[4])
         if self._single:
+            if self._is_round_over():
+                result = dataclasses.replace(result, delta=self._look_around_pose(result.delta))
             return result, (FramePart(frame=frame, status=status, delta=result.delta),)
         self._log.add(moves, taken, self.filter.pose)
         if not self._is_over():
@@ -255,17 +256,17 @@ class FramedFilter:
         while self._closed and self._closed[0].due <= self.steps:
             parts += self._corrected(self._closed.pop(0))
         late, self._late = self._late, []
-        return result, (*parts, *late)
+        return result, (*parts, *late, *self._corrections())
 
     def _take_decision(self, decision: Decision, result: StepResult, seen: Sightings) -> tuple[StepResult, Taken]:
         """What sightings were taken for holds from now on: the step as published, and as it is kept."""
         assert self._associator is not None
         z, Z = np.array(seen.z, float), np.array(seen.cov, float)
-        self._associator.take(self.steps, decision, z)
+        self._associator.take(decision, z)
         for key, number in decision.accepted.items():
-            self._log.rename(key, number)
+            self._log.accept(key, number)
             for closed in (*self._looked_at, *self._closed):  # with one sighting of it, it has nothing to test that by
-                closed.log.rename(key, number, least=2)
+                closed.log.accept(key, number, least=2)
         new = (UNKNOWN_SIGNATURE,) * len(result.new)
         result = dataclasses.replace(
             result, new=new, innovation=decision.innovation, sightings=decision.dof // 2,
@@ -285,76 +286,147 @@ class FramedFilter:
     def _close(self) -> Floats:
         """End the open frame where it is now, so that the next step begins another; its last pose."""
         end_pose = self.filter.pose
-        due = self.steps + self.settings.close_lag_steps
         live = self.filter
-        signatures = np.array(live.signatures, np.int64)
-        self._closed.append(Closed(self.frame, due, self._log, live.landmarks, signatures, live.called))
+        self._kept.append(
+            Closed(
+                frame=self.frame,
+                due=self.steps + self.settings.close_lag_steps,
+                log=self._log,
+                landmarks=live.landmarks,
+                signatures=np.array(live.signatures, np.int64),
+                numbers=live.called,
+                first_step=self.steps - len(self._log.motions),
+                aliases=len(self._own_map.aliases),
+            )
+        )
+        self._closed.append(self._kept[-1])
         self.totals.append(FrameTotal())
         self.totals[-1].add(live.published())
         self.ends.append(end_pose)
         if self._associator is not None:
-            self._look_around(self._closed[-1], self._associator)
+            self._look_around(self._kept[-1], self._associator)
+        self._forget()
         self._open()
         return end_pose
 
     def _look_around(self, closed: Closed, associator: Associator) -> None:
         """What lies around the end of a frame that closes, for the next."""
-        duplicates = associator.duplicates()
-        self._alias(duplicates.pairs)
-        for other, one in enumerate(first_names(self._own_map.aliases, len(self._names.signatures)).tolist()):
-            if one != other:
-                closed.log.rename(other, one)
-        solved = self._solved(closed)
-        self._own_map.put(closed.frame, self.totals[closed.frame].delta() if solved is None else solved[0])
+        before, own = set(self._own_map.aliases), self._own_map
+        known, total = len(self._names.signatures), self.totals[closed.frame].delta()
+        duplicates, _ = join(closed, associator, own, self.settings, self.model, known, total)
         try:
-            near = self._own_map.around(self.settings.association.local_landmarks_max, associator.reach_m)
+            near = own.around(self.settings.association.local_landmarks_max, associator.reach_m)
         except NumericalError as error:
             log.warning("own_map_not_solved frame=%d reason=%s", closed.frame, error)
             local = associator.local
             near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
-        associator.begin(self.steps, *near)
+        associator.begin(*near)
+        if not self._looks_wrong(duplicates.unclear, own):
+            self._doubtful_since = None
+        else:
+            if self._doubtful_since is None:
+                self._doubtful_since = closed.frame
+            self._find_way_back(closed.frame, self._doubtful_since, associator)
+        self._note_aliases(before)
         while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
             self._late += self._looked_at_again(self._looked_at.pop(0))
-        limits = self.settings.association
-        self.doubtful = duplicates.unclear > limits.unclear_max or self._own_map.misfit > limits.misfit_max
 
-    def _alias(self, pairs: Sequence[tuple[int, int]]) -> None:
-        """Landmarks that are one from now on."""
-        for pair in pairs:
-            one, other = min(pair), max(pair)
-            if (one, other) in self._own_map.aliases:
-                continue
-            self._own_map.aliases.append((one, other))
-            self._new_aliases.append((one, other, True))
+    def _looks_wrong(self, unclear: float, own: OwnMap) -> bool:
+        limits = self.settings.association
+        return unclear > limits.unclear_max or own.misfit > limits.misfit_max
+
+    def _looks_better(self, unclear: float, own: OwnMap) -> bool:
+        """Whether what was told anew looks right, by more than a hair, and its frames fit no worse than before."""
+        limits = self.settings.association
+        misfit_max = min(limits.misfit_max, BACK_MISFIT * max(self._own_map.misfit, 1.0))
+        return unclear <= BACK_UNCLEAR * limits.unclear_max and own.misfit <= misfit_max
+
+    def _find_way_back(self, frame: int, since: int, associator: Associator) -> None:
+        """Tell the last frames anew, from the further back the longer the doubt lasts; take it where it looks right."""
+        doubtful = frame - since + 1
+        if doubtful & (doubtful - 1):  # 1, 2, 4, 8 frames, ...
+            return
+        first = max(since - min(2 * doubtful, KEPT_FRAMES), 0)
+        again = [closed for closed in self._kept if closed.frame >= first]
+        if again[0].frame > first:
+            return
+        known = len(self._names.signatures)
+        found = told_anew(again, self._own_map, associator, self.settings, self.model, known)
+        if found is not None and self._looks_better(found.unclear, found.own_map):
+            log.info("way_back frame=%d doubtful_since=%d told_anew_from=%d", frame, since, first)
+            self._take_back(again, found)
+
+    def _take_back(self, before: list[Closed], found: ToldAnew) -> None:
+        """What was told anew holds from now on; its corrections are to be published."""
+        news = dict(zip(map(id, before), found.frames, strict=True))
+        for old, new in zip(before, found.frames, strict=True):
+            for i, ((step, names, z, Z), (_, told, _, _)) in enumerate(zip(old.log.sightings, new.log.sightings)):
+                names[:] = told  # the array that `assigned` has, too
+                new.log.sightings[i] = step, names, z, Z
+        self._kept, self._closed, self._looked_at = (
+            [news.get(id(closed), closed) for closed in frames]
+            for frames in (self._kept, self._closed, self._looked_at)
+        )
+        count = len(self._names.signatures)
+        self._names.add(list(range(count, found.known)))
+        self._begun += [(number, UNKNOWN_SIGNATURE) for number in range(count, found.known)]
+        self._own_map, self._associator, self._doubtful_since = found.own_map, found.associator, None
+        self._to_correct |= {closed.frame: each for closed, each in zip(found.frames, found.solved, strict=True)}
+
+    def _forget(self) -> None:
+        """Readings that are not needed any more."""
+        needed, first = {id(closed) for closed in (*self._closed, *self._looked_at)}, self.frame
+        if self._associator is not None:
+            sound = self.frame if self._doubtful_since is None else self._doubtful_since
+            first = max(sound - KEPT_FRAMES, self.frame - KEPT_FRAMES_MAX)
+        self._kept = [closed for closed in self._kept if closed.frame >= first or id(closed) in needed]
+
+    def _corrections(self) -> list[FramePart]:
+        """Some of what was told anew."""
+        parts = []
+        for frame in sorted(self._to_correct)[:CORRECTIONS_EACH]:
+            parts += self._replaced(frame, *self._to_correct[frame])
+        return parts
+
+    def _note_aliases(self, before: set[tuple[int, int]]) -> None:
+        """Pairs of landmarks that are one since then, or not any more."""
+        now = set(self._own_map.aliases)
+        self._new_aliases += [(a, b, True) for a, b in sorted(now - before)]
+        self._new_aliases += [(a, b, False) for a, b in sorted(before - now)]
+
+    def take_begun(self) -> tuple[tuple[int, int], ...]:
+        """Landmarks, and their signatures, that came to be on the way back from doubt, after those of the last step."""
+        taken, self._begun = tuple(self._begun), []
+        return taken
+
+    def _is_round_over(self) -> bool:
+        """Whether what lies around a vehicle of a single frame is to be looked at anew."""
+        associator, every = self._associator, self.settings.frame_steps_max
+        return associator is not None and (self.steps % every == 0 or associator.has_left(associator.local.pose))
+
+    def _look_around_pose(self, step: FrameDelta) -> FrameDelta:
+        """Rule 8, after a step with this delta; what is published instead of it."""
+        associator, limits = self._associator, self.settings.association
+        assert associator is not None
+        duplicates, before = associator.duplicates(), set(self._own_map.aliases)
+        self._own_map.join(duplicates.pairs)
+        self._note_aliases(before)
+        first = np.unique(first_names(self._own_map.aliases, len(self._names.signatures)))
+        try:
+            step = self.filter.join(duplicates.pairs, step)
+            near = around_pose(self.filter, first, limits.local_landmarks_max, associator.reach_m)
+        except NumericalError as error:
+            log.warning("not_looked_around step=%d reason=%s", self.steps, error)
+            near = begun_at(kept(associator.local, np.flatnonzero(associator.local.keys >= 0))), associator.travel_max_m
+        associator.begin(*near)
+        doubtful = duplicates.unclear > limits.unclear_max or associator.crowded() > CROWDED_MAX
+        self._doubtful_since = self.frame if doubtful else None
+        return step
 
     def take_aliases(self) -> tuple[tuple[int, int, bool], ...]:
         """Pairs of landmarks that have become one, or are not any more, since the last call: to be published."""
         taken, self._new_aliases = tuple(self._new_aliases), []
         return taken
-
-    def _solved(self, closed: Closed) -> tuple[FrameDelta, Floats] | None:
-        """The batch over a closed frame as one cumulative delta, and its end pose; None where it fails."""
-        if not closed.log.motions:
-            return None
-        signatures, landmarks, numbers = closed.signatures, closed.landmarks, closed.numbers
-        if self._associator is not None:
-            signatures, landmarks = closed.log.guesses(self.model, signatures, landmarks)
-            numbers = signatures
-        try:
-            batch = closed.log.solved(self.model, signatures, landmarks, self.settings.frame_huber)
-            if self._associator is not None:
-                known = signatures[batch.seen], batch.mean[3:].reshape(-1, 2)[batch.seen]
-                if closed.log.decided_again(self.model, batch.poses, *known):
-                    batch = closed.log.solved(self.model, signatures, landmarks, self.settings.frame_huber)
-            closed.poses = batch.poses
-            order = np.argsort(numbers)
-            order = order[batch.seen[order]]
-            rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
-            variables = np.concatenate([[0], 1 + numbers[order]]).astype(np.int64)
-            H, b, mean = batch.H[np.ix_(rows, rows)], batch.b[rows], batch.mean[rows]
-            return quantised(variables, H, b, mean), batch.mean[:3]
-        except NumericalError:
-            return None
 
     def _corrected(self, closed: Closed) -> list[FramePart]:
         """The correction of a frame, which is looked at again later where sightings are associated."""
@@ -373,11 +445,13 @@ class FramedFilter:
 
     def _correction(self, closed: Closed) -> list[FramePart]:
         """What the batch over a closed frame changes, to be published; nothing where it fails, or nothing moved."""
-        solved, total = self._solved(closed), self.totals[closed.frame]
-        if solved is None:
-            return []
-        whole, end_pose = solved
-        change = FrameTotal()
+        solved = closed.solved(self.settings, self.model)
+        return [] if solved is None else self._replaced(closed.frame, *solved)
+
+    def _replaced(self, frame: int, whole: FrameDelta, end_pose: Floats) -> list[FramePart]:
+        """The correction after which a frame says this, and ends there."""
+        self._to_correct.pop(frame, None)
+        total, change = self.totals[frame], FrameTotal()
         try:
             change.add(whole)
             change.subtract(total.delta())
@@ -385,24 +459,28 @@ class FramedFilter:
             return []
         delta = change.delta()
         total.add(delta)
-        self.ends[closed.frame] = end_pose
+        self.ends[frame] = end_pose
         if self._associator is not None:
-            self._own_map.put(closed.frame, whole)
-        return [FramePart(frame=closed.frame, status=FrameStatus.CORRECTED, delta=delta, end_pose=end_pose)]
+            self._own_map.put(frame, whole)
+        return [FramePart(frame=frame, status=FrameStatus.CORRECTED, delta=delta, end_pose=end_pose)]
 
     def end(self) -> tuple[FramePart, ...]:
         """Close the open frame and correct all that is outstanding."""
         parts: list[FramePart] = []
         if self._opened:
-            frame, nothing = self.frame, FrameDelta.nothing()
+            frame, last = self.frame, FrameDelta.nothing()
+            if self._single and self._associator is not None:
+                last = self._look_around_pose(last)
             end_pose = self.filter.pose if self._single else self._close()
-            parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=nothing, end_pose=end_pose))
+            parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=last, end_pose=end_pose))
         for closed in self._closed:
             parts += self._corrected(closed)
         for closed in self._looked_at:
             parts += self._looked_at_again(closed)
         parts += self._late
-        self._closed, self._looked_at, self._late = [], [], []
+        while self._to_correct:
+            parts += self._corrections()
+        self._kept, self._closed, self._looked_at, self._late = [], [], [], []
         self._localised = self.steps - self.settings.localise_steps
         return tuple(parts)
 
@@ -413,46 +491,55 @@ class FramedFilter:
             "filter": self.filter.state(), "steps": self.steps, "opened": self._opened, "assigned": assigned.tobytes(),
             "associator": self._associator and self._associator.state(),
         }  # fmt: skip
+        if self._associator is not None:
+            state |= {"doubtful_since": self._doubtful_since, "own": self._own_map.state()}
+        if self._has_names:
+            state["signatures"] = list(self._names.signatures)
         if self._single:
             return state
         return {
-            **state, "signatures": list(self._names.signatures), "log": self._log.state(),
-            "closed": [each.state() for each in self._closed],
-            "looked_at": [each.state() for each in self._looked_at],
+            **state, "log": self._log.state(),
+            "kept": [each.state() for each in self._kept],
+            "closed": [each.frame for each in self._closed],
+            "looked_at": [each.frame for each in self._looked_at],
             "totals": [pack_delta(total.delta()) for total in self.totals],
-            "doubtful": self.doubtful, "new_aliases": list(self._new_aliases), "own": self._own_map.state(),
+            "to_correct": [
+                (frame, pack_delta(whole), end.tobytes()) for frame, (whole, end) in self._to_correct.items()
+            ],
             "ends": np.array(self.ends).tobytes(),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on where `state` was taken, to the bit. Raises ValueError where it is not the state of a filter."""
-        if not self._single:
+        if self._has_names:
             self._names.add(list(state["signatures"]))
         self.filter.restore(state["filter"])
         self.steps, self._opened = state["steps"], state["opened"]
         self._assigned = [np.frombuffer(state["assigned"], np.int64).copy()]
         if self._associator is not None:
             self._associator.restore(state["associator"])
+            self._doubtful_since = state["doubtful_since"]
+            self._own_map.restore(state["own"])
         if self._single:
             return
         self._localised = self.steps - self.settings.localise_steps
         self._log = FrameLog.restored(state["log"])
-        self._closed = [Closed.restored(each) for each in state["closed"]]
-        self._looked_at = [Closed.restored(each) for each in state["looked_at"]]
+        self._kept = [Closed.restored(each) for each in state["kept"]]
+        by_frame = {closed.frame: closed for closed in self._kept}
+        self._closed = [by_frame[frame] for frame in state["closed"]]
+        self._looked_at = [by_frame[frame] for frame in state["looked_at"]]
         self._share_keys()
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
-        self.doubtful = state["doubtful"]
-        self._new_aliases = [(a, b, added) for a, b, added in state["new_aliases"]]
-        self._own_map.restore(state["own"])
+        self._to_correct = {frame: (read_delta(whole), np.frombuffer(end)) for frame, whole, end in state["to_correct"]}
         self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
 
     def _share_keys(self) -> None:
         """What sightings are taken for is kept once: by the logs of frames and by `assigned`."""
         if self._associator is None:
             return
-        (keys,), logs = self._assigned, [closed.log for closed in (*self._looked_at, *self._closed)]
+        (keys,), logs = self._assigned, [closed.log for closed in self._kept]
         logs.append(self._log)
         at = len(keys) - sum(len(names) for each in logs for _, names, _, _ in each.sightings)
         for each in logs:

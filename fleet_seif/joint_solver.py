@@ -97,13 +97,16 @@ class JointSolver:
         return self.replay(lives, classes)
 
     @one_thread
-    def solve_from(self, life: Life, classes: Classes, landmarks: Floats, poses: Floats) -> JointSolution:
+    def solve_from(
+        self, life: Life, classes: Classes, landmarks: Floats, poses: Floats, enough: float = WARM_ENOUGH
+    ) -> JointSolution:
         """The map of one life, whose start pose is given, from an estimate on. Where that fails it replays.
 
         Raises NumericalError where the system is not positive definite or does not settle.
 
         Args:
             landmarks (n, 2): by number, m; NaN unknown. poses (k, 3): where frames 1 .. k start.
+            enough: as WARM_ENOUGH.
         """
         registry = Registry(self._records)
         added = registry.register([life], classes).added
@@ -118,7 +121,7 @@ class JointSolver:
         estimate.begin_at(variables, np.vstack([at, poses]))
         try:
             estimate.take(added)
-            settled = self._settled(estimate)
+            settled = self._settled(estimate, enough)
         except NumericalError:
             settled = None
         if settled is None:
@@ -140,10 +143,10 @@ class JointSolver:
             raise ValueError("joint_covariance is of the last solution only: solve again")
         return estimate.covariance(np.concatenate([variable[count + poses], variable[landmarks]]))
 
-    def _settled(self, estimate: Estimate) -> Evaluation | None:
+    def _settled(self, estimate: Estimate, enough: float = WARM_ENOUGH) -> Evaluation | None:
         """All of it."""
         self._changed.clear()
-        settled, at = estimate.settle(WARM_ITERATIONS_MAX, WARM_ENOUGH)
+        settled, at = estimate.settle(WARM_ITERATIONS_MAX, enough)
         return at if settled else None
 
     def _settled_near(self, estimate: Estimate, change: Change, lives: Sequence[Life]) -> Evaluation | None:

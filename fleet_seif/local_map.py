@@ -8,7 +8,7 @@
 4. Every function returns a new map: a step that is refused in the end has changed nothing.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -89,10 +89,30 @@ def _seen(spread: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
 
 
 @kernel
+def _rows(which: Ints) -> Ints:
+    """Rows of the pose and of these landmarks, shape (3 + 2 c,)."""
+    rows = np.arange(3 + 2 * len(which))
+    for i in range(len(which)):
+        rows[3 + 2 * i], rows[4 + 2 * i] = 3 + 2 * which[i], 4 + 2 * which[i]
+    return rows
+
+
+@kernel
+def _kept(mean: Floats, P: Floats, rows: Ints) -> tuple[Floats, Floats]:
+    part = np.empty((len(rows), len(rows)))
+    for i in range(len(rows)):
+        for j in range(len(rows)):
+            part[i, j] = P[rows[i], rows[j]]
+    return mean[rows], part
+
+
+@kernel
 def expected(model: int, mean: Floats, P: Floats, which: Ints) -> tuple[Floats, Floats]:
     """Sightings of these landmarks: expected h (c, 2), their joint covariance J P J' (2 c, 2 c) without noise."""
-    h, J_x, J_y = _blocks(model, mean, which)
-    return h, _seen(_spread(P, which, J_x, J_y), which, J_x, J_y)
+    mean, P = _kept(mean, P, _rows(which))
+    all_of_them = np.arange(len(which))
+    h, J_x, J_y = _blocks(model, mean, all_of_them)
+    return h, _seen(_spread(P, all_of_them, J_x, J_y), all_of_them, J_x, J_y)
 
 
 @kernel
@@ -123,6 +143,15 @@ def from_pose_std(P: Floats, i: int) -> float:
 
 
 @kernel
+def from_pose_stds(P: Floats, which: Ints) -> Floats:
+    """The same of several landmarks, shape (c,)."""
+    stds = np.empty(len(which))
+    for k in range(len(which)):
+        stds[k] = from_pose_std(P, which[k])
+    return stds
+
+
+@kernel
 def squared_distances_from(model: int, x: Floats, mean: Floats, P: Floats, which: Ints, z: Floats, Z: Floats) -> Floats:
     """r' (Z + J_y P_yy J_y')^-1 r of sightings from a certain pose x (3,) with these landmarks, shape (s, c)."""
     out = np.empty((len(z), len(which)))
@@ -140,15 +169,30 @@ def squared_distances_from(model: int, x: Floats, mean: Floats, P: Floats, which
     return out
 
 
+@kernel
+def _moved(model: int, mean: Floats, P: Floats, u: Floats, cov: Floats) -> tuple[Floats, Floats]:
+    """x' = g(x, u)        P' = J_x P J_x' + J_u cov J_u', where J_x leaves landmarks as they are."""
+    pose, J_x, J_u = move(model, mean[:3], u)
+    mean, P = mean.copy(), P.copy()
+    mean[:3] = pose
+    for j in range(3, len(P)):
+        a, b, c = P[0, j], P[1, j], P[2, j]
+        for i in range(3):
+            P[i, j] = P[j, i] = J_x[i, 0] * a + J_x[i, 1] * b + J_x[i, 2] * c
+    old, new = P[:3, :3].copy(), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            for k in range(3):
+                for m in range(3):
+                    new[i, j] += J_x[i, k] * old[k, m] * J_x[j, m] + J_u[i, k] * cov[k, m] * J_u[j, m]
+            P[i, j] = P[j, i] = new[i, j]
+    return mean, P
+
+
 def moved(model: int, local: LocalMap, u: Floats, cov: Floats) -> LocalMap:
     """After odometry u (3,) with covariance cov (3, 3)."""
-    pose, J_x, J_u = move(model, local.pose, u)
-    mean, P = local.mean.copy(), local.P.copy()
-    mean[:3] = pose
-    P[:3] = J_x @ P[:3]
-    P[:, :3] = P[:, :3] @ J_x.T
-    P[:3, :3] += J_u @ cov @ J_u.T
-    return replace(local, mean=mean, P=P)
+    mean, P = _moved(model, local.mean, local.P, u, cov)
+    return LocalMap(mean, P, local.keys)
 
 
 @kernel
@@ -157,31 +201,6 @@ def _innovations(model: int, z: Floats, h: Floats) -> Floats:
     for i in range(len(z)):
         r[2 * i], r[2 * i + 1] = innovation_numbers(model, z[i, 0], z[i, 1], h[i, 0], h[i, 1])
     return r
-
-
-def sighted(model: int, local: LocalMap, which: Ints, z: Floats, Z: Floats) -> tuple[LocalMap, float]:
-    """After sightings of these landmarks, all at once; and the squared normalised innovation r' S^-1 r.
-
-    S = J P J' + Z        mean' = mean + P J' S^-1 r        P' = P - P J' S^-1 J P
-
-    Raises NumericalError where S is not positive definite.
-
-    Args:
-        which (m,): positions in the map. z (m, 2), Z (m, 2, 2).
-    """
-    if not len(which):
-        return local, 0.0
-    h, J_x, J_y = _blocks(model, local.mean, which)
-    spread = _spread(local.P, which, J_x, J_y)
-    S, r = _seen(spread, which, J_x, J_y), _innovations(model, z, h)
-    for i in range(len(which)):
-        S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += Z[i]
-    gain, w = np.ascontiguousarray(spread.T), r.copy()
-    if not _halved_into(gain, w, S):
-        raise NumericalError("the covariance of sightings is not positive definite: reading refused")
-    P = local.P.copy()
-    _shrink(P, gain)
-    return replace(local, mean=local.mean + w @ gain, P=P), float(w @ w)
 
 
 @kernel
@@ -201,37 +220,92 @@ def _halved_into(gain: Floats, w: Floats, S: Floats) -> bool:
 
 
 @kernel
-def _shrink(P: Floats, gain: Floats) -> None:
-    """P - G'G in place of P (n, n), which stays symmetric. Loops: a library wakes threads for so little."""
+def _less(P: Floats, gain: Floats) -> Floats:
+    """P - G'G, exactly symmetric; G (m, n) has an even number of rows. Loops: a library wakes threads for so little."""
+    out = np.empty_like(P)
     for i in range(len(P)):
-        for k in range(len(gain)):
-            a = gain[k, i]
+        for j in range(i + 1):
+            out[i, j] = P[i, j]
+        for k in range(0, len(gain), 2):
+            a, b = gain[k, i], gain[k + 1, i]
             for j in range(i + 1):
-                P[i, j] -= a * gain[k, j]
+                out[i, j] -= a * gain[k, j] + b * gain[k + 1, j]
     for i in range(len(P)):
         for j in range(i):
-            P[j, i] = P[i, j]
+            out[j, i] = out[i, j]
+    return out
+
+
+@kernel
+def _sighted(
+    model: int, mean: Floats, P: Floats, which: Ints, z: Floats, Z: Floats
+) -> tuple[bool, Floats, Floats, float]:
+    """Whether S is positive definite, then mean', P' and r' S^-1 r: see `sighted`."""
+    h, J_x, J_y = _blocks(model, mean, which)
+    spread = _spread(P, which, J_x, J_y)
+    S, w = _seen(spread, which, J_x, J_y), _innovations(model, z, h)
+    for i in range(len(which)):
+        S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += Z[i]
+    gain = np.ascontiguousarray(spread.T)
+    if not _halved_into(gain, w, S):
+        return False, mean, P, 0.0
+    new, squared = mean.copy(), 0.0
+    for k in range(len(w)):
+        new += w[k] * gain[k]
+        squared += w[k] * w[k]
+    return True, new, _less(P, gain), squared
+
+
+def sighted(model: int, local: LocalMap, which: Ints, z: Floats, Z: Floats) -> tuple[LocalMap, float]:
+    """After sightings of these landmarks, all at once; and the squared normalised innovation r' S^-1 r.
+
+    S = J P J' + Z        mean' = mean + P J' S^-1 r        P' = P - P J' S^-1 J P
+
+    Raises NumericalError where S is not positive definite.
+
+    Args:
+        which (m,): positions in the map. z (m, 2), Z (m, 2, 2).
+    """
+    if not len(which):
+        return local, 0.0
+    sound, mean, P, squared = _sighted(model, local.mean, local.P, which, z, Z)
+    if not sound:
+        raise NumericalError("the covariance of sightings is not positive definite: reading refused")
+    return LocalMap(mean, P, local.keys), squared
+
+
+@kernel
+def _with_new(model: int, mean: Floats, P: Floats, y: Floats, Z: Floats) -> tuple[Floats, Floats]:
+    n = len(mean)
+    whole, wider = np.concatenate((mean, y)), np.empty((n + 2, n + 2))
+    _, J_x, J_y = _blocks(model, whole, np.full(1, (n - 3) // 2))
+    G_z = inverse_2x2(J_y[0])
+    wider[:n, :n] = P
+    for i in range(2):
+        g = -(G_z[i, 0] * J_x[0, 0] + G_z[i, 1] * J_x[0, 1])
+        wider[n + i, :n] = g[0] * P[0] + g[1] * P[1] + g[2] * P[2]
+        wider[:n, n + i] = wider[n + i, :n]
+        for j in range(i + 1):
+            f = -(G_z[j, 0] * J_x[0, 0] + G_z[j, 1] * J_x[0, 1])
+            total = 0.0
+            for k in range(3):
+                total += wider[n + i, k] * f[k]
+            for k in range(2):
+                for m in range(2):
+                    total += G_z[i, k] * Z[k, m] * G_z[j, m]
+            wider[n + i, n + j] = wider[n + j, n + i] = total
+    return whole, wider
 
 
 def with_new(model: int, local: LocalMap, key: int, z: Floats, Z: Floats) -> LocalMap:
     """With one more landmark, where a sighting puts it: y = f(x, z), P_yy = G_x P_xx G_x' + G_z Z G_z'."""
-    n = len(local.mean)
-    y = place(model, local.pose, z)
-    _, J_x, J_y = _blocks(model, np.concatenate([local.pose, y]), np.zeros(1, np.int64))
-    G_z = inverse_2x2(J_y[0])
-    G_x = -G_z @ J_x[0]
-    P = np.empty((n + 2, n + 2))
-    P[:n, :n] = local.P
-    P[n:, :n] = G_x @ local.P[:3]
-    P[:n, n:] = P[n:, :n].T
-    P[n:, n:] = G_x @ local.P[:3, :3] @ G_x.T + G_z @ Z @ G_z.T
-    return LocalMap(np.concatenate([local.mean, y]), P, np.append(local.keys, key))
+    mean, P = _with_new(model, local.mean, local.P, place(model, local.pose, z), Z)
+    return LocalMap(mean, P, np.append(local.keys, key))
 
 
 def kept(local: LocalMap, which: Ints) -> LocalMap:
     """Only these landmarks."""
-    rows = np.concatenate([np.arange(3), (3 + 2 * which[:, None] + np.arange(2)).ravel()])
-    return LocalMap(local.mean[rows], local.P[np.ix_(rows, rows)], local.keys[which])
+    return LocalMap(*_kept(local.mean, local.P, _rows(which)), local.keys[which])
 
 
 @kernel

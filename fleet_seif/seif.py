@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 
@@ -19,11 +20,12 @@ from fleet_seif.config import FilterSettings
 from fleet_seif.errors import NumericalError, ReadingRefused
 from fleet_seif.filters import Names, StepResult, checked_reading
 from fleet_seif.frame_deltas import renumbered
-from fleet_seif.information import QUANTA_MAX, FrameDelta, quanta
+from fleet_seif.information import H_QUANTUM, QUANTA_MAX, FrameDelta, FrameTotal, largest_growth, quanta
 from fleet_seif.local_updates import KL, NORMALISED, RAW
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.records import Floats, Ints, Reading, Sightings
 from fleet_seif.seif_arrays import ACTIVE, LANDMARKS, LINKS, LINKS_EACH
+from fleet_seif.seif_join import seif_join
 
 FAULTS = {
     kernels.NOT_FINITE: "a number is not finite",
@@ -154,6 +156,31 @@ class Seif:
             first_new, tuple(unknown), innovation, int(used), int(refused), int(self._s.counts[ACTIVE]),
         )  # fmt: skip
 
+    def join(self, pairs: Sequence[tuple[int, int]], step: FrameDelta) -> FrameDelta:
+        """Hold pairs of landmarks that are one together (seif_join), after a step with this delta; both deltas in one.
+
+        As certain as a frame's start, but no more than the step may still add (step_information_max).
+        Raises NumericalError where it cannot be done; nothing has changed then.
+        """
+        if not pairs:
+            return step
+        most = self._growth_max - largest_growth(step)
+        W = min(self.settings.start_information, 0.5 * most * H_QUANTUM / len(pairs))
+        if self._s.counts[LINKS] + len(pairs) > len(self._s.H_link):
+            self._grow(2 * len(self._s.H_link) + len(pairs))
+        own = np.array(pairs, np.int64).reshape(-1, 2)
+        code, variables, rows, cols, H, b = seif_join(
+            self._floats, self._ints, own, W, self.settings.relax_others, self.called
+        )
+        if code != kernels.OK:
+            raise NumericalError("landmarks cannot be joined: the filter's matrix would not stay positive definite")
+        if self.settings.mean == "exact":
+            self.recover()
+        total = FrameTotal()
+        total.add(step)
+        total.add(FrameDelta(variables=variables, rows=rows, cols=cols, H=H, b=b))
+        return total.delta()
+
     def _refuse(self, code: int, u: Floats, z: Floats) -> None:
         if code in FAULTS:
             raise ReadingRefused(f"reading refused: {FAULTS[code]}; u={u.tolist()} z={z.tolist()}")
@@ -238,14 +265,22 @@ class Seif:
         unit[rows, np.arange(len(rows))] = 1.0
         return np.asarray(scipy.sparse.linalg.splu(H).solve(unit)[rows])
 
-    def blanket_covariance(self, number: int) -> Floats:
-        """Covariance of the pose and one landmark from their neighbourhood alone, shape (5, 5): eq. (54), (55).
+    def blanket_covariance(self, numbers: Sequence[int]) -> Floats:
+        """Joint covariance of the pose and these landmarks from their neighbourhood alone, shape (3 + 2 k, 3 + 2 k).
 
-        The rest of the map is conditioned on, not marginalised out, so the result is at most the exact one. The
-        neighbourhood is the active landmarks, this one and its neighbours; where they do not meet, the landmarks of a
-        shortest path between them belong to it too. Its cost follows the neighbourhood.
+        SEIF paper eq. (54), (55), for several landmarks:  P = S (H_BB)^-1 S',  S taking pose and landmarks out of B
+
+        B, the combined Markov blanket: the pose, the active landmarks, these landmarks and their neighbours; where a
+        landmark and its neighbours do not meet the others, the landmarks of a shortest path to them belong to it too.
+        The rest of the map is conditioned on, not marginalised out, so the result is at most the exact one. Its cost
+        follows B, not the map. Raises NumericalError where H is not positive definite there.
         """
-        ids = kernels.blanket(self._s, number)
+        ids = kernels.blanket(self._s, np.array(numbers, np.int64))
         H, _, _, _, _ = kernels.gather(self._s, ids)
-        rows = [0, 1, 2, *(3 + 2 * int(np.searchsorted(ids, number)) + axis for axis in (0, 1))]
-        return np.asarray(np.linalg.solve(H, np.eye(len(H))[:, rows])[rows])
+        at = np.searchsorted(ids, numbers)
+        rows = np.concatenate([np.arange(3), (3 + 2 * at[:, None] + np.arange(2)).ravel()])
+        try:
+            P = scipy.linalg.cho_solve(scipy.linalg.cho_factor(H, lower=True), np.eye(len(H))[:, rows])[rows]
+        except np.linalg.LinAlgError as error:
+            raise NumericalError("the information matrix of a neighbourhood is not positive definite") from error
+        return np.asarray((P + P.T) / 2)

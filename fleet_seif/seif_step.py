@@ -678,21 +678,29 @@ def seif_step(
 
 
 @kernel
-def blanket(s: SeifArrays, number: int) -> Ints:
-    """Landmarks in the combined Markov blanket of the pose and one landmark, ascending; see Seif.blanket_covariance.
+def blanket(s: SeifArrays, numbers: Ints) -> Ints:
+    """The combined Markov blanket of the pose and these landmarks, ascending; see Seif.blanket_covariance."""
+    ids = s.active[: s.counts[ACTIVE]].copy()
+    for number in numbers:
+        ids = joined_blanket(s, ids, number)
+    return ids
 
-    Where the two do not meet, a breadth-first search from the landmark finds a shortest path to an active one; its cost
+
+@kernel
+def joined_blanket(s: SeifArrays, ids: Ints, number: int) -> Ints:
+    """The set `ids`, ascending, with one more landmark and its neighbours.
+
+    Where these do not meet the set, a breadth-first search from the landmark finds a shortest path to it; its cost
     follows what lies in between.
     """
     n = s.counts[LANDMARKS]
-    active = s.active[: s.counts[ACTIVE]]
     found, reached = np.empty(n, np.int64), 1
     found[0], s.local[number] = number, number + 1
     at, neighbours, meets = 0, 1, -1
     while meets == -1 and at < reached:
         y = found[at]
-        here = np.searchsorted(active, y)
-        if here < len(active) and active[here] == y:
+        here = np.searchsorted(ids, y)
+        if here < len(ids) and ids[here] == y:
             meets = y
         half = s.first[y] - 1
         while half >= 0:
@@ -706,7 +714,7 @@ def blanket(s: SeifArrays, number: int) -> Ints:
         if at == 0:
             neighbours = reached
         at += 1
-    ids = block_ids(active, found[:neighbours])
+    ids = block_ids(ids, found[:neighbours])
     while meets != -1 and meets != number:
         ids = block_ids(ids, np.array([meets]))
         meets = s.local[meets] - 1

@@ -14,12 +14,13 @@ from fleet_seif.definite import is_positive_definite
 from fleet_seif.frame_deltas import quantised
 from fleet_seif.frames import FramedFilter
 from fleet_seif.geometry import between
-from fleet_seif.information import FrameTotal, largest_growth, to_information
+from fleet_seif.information import FrameDelta, FrameTotal, largest_growth, to_information
 from fleet_seif.joint import Life, landmark_classes, marginal_covariances, solve
 from fleet_seif.joint_tree import LEAF_PIECES_MAX
 from fleet_seif.local_map import squared_distances_from
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus, Hello
 from fleet_seif.models import RANGE_BEARING
+from fleet_seif.own_window import joined, view
 from fleet_seif.records import Reading, Sightings
 from fleet_seif.seif import Seif
 from fleet_seif.wire import decode_message, encode_message
@@ -32,17 +33,22 @@ SEEN = Sightings(
 )
 
 
-def _tell_apart() -> None:
+def _tell_apart(frames: Literal["single", "adaptive"]) -> None:
     """What a vehicle runs besides where nothing says what it sees."""
     association = AssociationSettings(confirm_sightings=1)
     framed = FramedFilter(
-        FilterSettings(frame_steps_max=1, close_lag_steps=1, identities="associated", association=association)
+        FilterSettings(
+            frames=frames, frame_steps_max=1, close_lag_steps=1, identities="associated", association=association
+        )
     )
     framed.start(SEEN)
     for k, seen in enumerate((SEEN, Sightings.none(), Sightings.none(), SEEN), start=1):
         framed.step(Reading(time_s=float(k), odometry=np.zeros(3), odometry_cov=1e-4 * np.eye(3), sightings=seen))
+    if frames == "single":
+        framed.filter.join([(0, 1)], FrameDelta.nothing())
     pairs = Candidates(np.zeros((1, 2)), np.eye(2), np.array([[0, 1]]), np.eye(2, dtype=bool), np.ones(1))
     grown(pairs, 0, 1.0)
+    joined([view(quantised(np.zeros(1, np.int64), np.eye(3), np.zeros(3), np.zeros(3)))] * 2, np.ones(2))
     mean, which = np.array([0.0, 0.0, 0.0, 1.0, 0.0]), np.zeros(1, np.int64)
     squared_distances_from(RANGE_BEARING, np.zeros(3), mean, np.eye(5), which, SEEN.z, SEEN.cov)
 
@@ -95,6 +101,6 @@ def warm_up(
     )
     decode_message(encode_message(message))
     if identities == "associated":
-        _tell_apart()
+        _tell_apart(frames)
     notice.cancel()
     return time.perf_counter() - begin

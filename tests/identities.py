@@ -34,6 +34,13 @@ from scenarios.report import FinishedRun, evaluate
 from scenarios.score import align, landmark_truths
 from scenarios.source import record
 
+HALFWAY: Final = (
+    "noise.forward_std_m=0.007",
+    "noise.turn_std_rad=0.055",
+    "noise.range_std_m=0.02",
+    "noise.bearing_std_rad=0.033",
+)
+"""Noise half way from mild to the paper's."""
 PRECISION_LEAST: Final = 0.97
 DUPLICATES_MAX: Final = 3
 OFF_M: Final = 0.025

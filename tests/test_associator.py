@@ -48,7 +48,7 @@ class Standing:
     def look(self, *places: Sequence[float] | Floats) -> list[int]:
         """One step; what its sightings are taken for."""
         decision = self.decide(*places)
-        self.associator.take(self.step, decision, self.seen(*places)[0])
+        self.associator.take(decision, self.seen(*places)[0])
         self.numbers += sorted(decision.accepted.values())
         self.step += 1
         return [int(key) for key in decision.keys]
@@ -156,7 +156,7 @@ def test_it_goes_on_from_its_state_to_the_bit() -> None:
         if k == 20:
             near = LocalMap(np.array([0.0, 0.0, 0.0, 1.0, 0.0]), np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4]), np.array([0]))
             for each in (whole, again):
-                each.associator.begin(each.step - 1, near, 7.0)
+                each.associator.begin(near, 7.0)
         assert stored(again.associator) == stored(whole.associator)
     assert len(whole.numbers) > 5
 
@@ -215,7 +215,7 @@ def test_a_step_without_sightings_is_taken_and_moves_the_pose() -> None:
     decision = vehicle.associator.decide(1, (u, cov), z, Z, 0)
     assert (decision.keys.tolist(), decision.accepted, decision.dof) == ([], {}, 0)
     assert np.array_equal(decision.local.pose, u)
-    vehicle.associator.take(1, decision, z)
+    vehicle.associator.take(decision, z)
     assert np.array_equal(vehicle.associator.local.pose, u)
 
 
@@ -253,7 +253,7 @@ def two_known(std_m: float) -> Standing:
         vehicle.look((2.0, 0.0), (2.0, 1.0))
     mean = np.array([0.0, 0.0, 0.0, 2.0, 0.0, 2.0, 1.0])
     near = LocalMap(mean, np.diag([0.0, 0.0, 0.0, *[std_m**2] * 4]), np.array([0, 1]))
-    vehicle.associator.begin(2, near, 10.0)
+    vehicle.associator.begin(near, 10.0)
     return vehicle
 
 
@@ -290,7 +290,7 @@ def test_a_provisional_landmark_is_carried_into_the_next_frame() -> None:
     for _ in range(2):
         vehicle.look((1.0, 0.0), (0.0, 1.0))
     near = LocalMap(np.array([0.0, 0.0, 0.0, 3.0, 3.0]), np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4]), np.array([9]))
-    vehicle.associator.begin(1, near, 5.0)
+    vehicle.associator.begin(near, 5.0)
     assert vehicle.look((1.0, 0.0), (0.0, 1.0)) == [0, 1]
     assert vehicle.associator.local.keys.tolist() == [9, 0, 1]
 
@@ -298,7 +298,7 @@ def test_a_provisional_landmark_is_carried_into_the_next_frame() -> None:
 def test_a_frame_has_been_left_where_the_local_map_may_lack_what_is_sighted() -> None:
     associator = Associator(SETTINGS, RANGE_BEARING)
     assert not associator.has_left(np.array([1e9, 0.0, 0.0]))
-    associator.begin(0, LocalMap(np.zeros(3), np.zeros((3, 3)), np.empty(0, np.int64)), 5.0)
+    associator.begin(LocalMap(np.zeros(3), np.zeros((3, 3)), np.empty(0, np.int64)), 5.0)
     assert not associator.has_left(np.array([2.9, 4.0, 3.0]))
     assert associator.has_left(np.array([3.0, 4.0, 0.0]))
 

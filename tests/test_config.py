@@ -41,7 +41,6 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
         (WORLD + "[detection]\nclutter_share = 0.1\n", ["[detection]", "no signature", 'signatures = "none"']),
         ("[dataset]\nkind = 'mrclam'\n[detection]\nmissed_share = 0.1\n", ["[detection]", "signatures only"]),
         (WORLD + "[detection]\nsignatures = 'none'\n", ["refused", 'filter.identities = "associated"']),
-        (WORLD + "[filter]\nidentities = 'associated'\nframes = 'single'\n", ["[filter]", 'frames = "adaptive"']),
         (WORLD + "[filter]\nidentities = 'guessed'\n", ["[filter.identities]", "'signatures' or 'associated'"]),
         ("[world\n", ["not TOML"]),
     ],

@@ -39,6 +39,7 @@ from scenarios.experiments.names import EXPERIMENTS, find_experiment, run_experi
 from scenarios.experiments.study import Row, csv_of, png_of, summary_of, write_csv, write_summary
 from scenarios.experiments.worlds import World, compass_world, paper_world
 from scenarios.score import chi_square_band
+from tests.blankets import compared
 from tests.processes import invoke, refused
 from tests.strategies import settled
 
@@ -197,6 +198,16 @@ def test_in_the_linear_world_eseif_is_consistent_and_a_very_sparse_seif_is_not()
 def test_the_likelihood_from_a_markov_blanket_is_exact_while_the_blanket_holds_the_map() -> None:
     assert np.median(likelihood_errors(seif(LANDMARKS).settings, small_world())) < 1e-6
     assert np.median(likelihood_errors(seif(4).settings, small_world())) < 0.05
+
+
+def test_standard_deviations_from_a_markov_blanket_are_at_most_the_exact_ones_and_hold_for_the_whole_map() -> None:
+    whole = compared(LANDMARKS, [small_world()])
+    assert np.abs(np.array(whole.ratios) - 1.0).max() < 1e-6
+    assert whole.differ == 0
+    sparse = compared(4, [paper_world(50, 4, steps=400)])
+    assert max(sparse.sizes) < 50
+    assert 0.5 < min(sparse.ratios) < 0.99
+    assert max(sparse.ratios) < 1.0 + 1e-6
 
 
 def test_the_compass_world_is_read_with_a_linear_model() -> None:

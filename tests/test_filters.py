@@ -327,7 +327,7 @@ def test_a_covariance_from_the_neighbourhood_is_its_dense_conditional_and_at_mos
     apart = 0
     for number in range(len(seif.landmarks)):
         blanket = set(seif.active.tolist()) | linked[number] | {number}
-        got = seif.blanket_covariance(number)
+        got = seif.blanket_covariance([number])
         assert np.linalg.eigvalsh(seif.covariance_of([number]) - got)[0] > -1e-9 * np.max(np.abs(got))
         if not linked[number] & set(seif.active.tolist()):
             apart += 1  # the path between them belongs to it too
@@ -339,6 +339,66 @@ def test_a_covariance_from_the_neighbourhood_is_its_dense_conditional_and_at_mos
         expected = np.linalg.inv(H[np.ix_(rows, rows)])[np.ix_(own, own)]
         np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-13)
     assert apart > 0
+
+
+def neighbours(seif: Seif) -> dict[int, set[int]]:
+    """Of each landmark, by the blocks of H that are not zero."""
+    H, _ = dense(seif)
+    rows = [slice(3 + 2 * y, 5 + 2 * y) for y in range(len(seif.landmarks))]
+    return {a: {b for b in range(len(rows)) if b != a and np.any(H[rows[a], rows[b]])} for a in range(len(rows))}
+
+
+def links_between(linked: dict[int, set[int]], start: int, ends: set[int], within: set[int]) -> int:
+    """Links on a shortest way from a landmark to one of `ends`."""
+    front, links = {start}, 0
+    while not front & ends:
+        front |= {b for a in front for b in linked[a]} & within
+        links += 1
+        assert links <= len(linked), "there is no way"
+    return links
+
+
+FAR_APART = ([59], [40, 41, 44], [0, 1, 2, 3], [20, 3, 58], [7, 6, 30, 31, 57])
+
+
+@pytest.mark.parametrize("numbers", FAR_APART)
+def test_the_neighbourhood_of_several_landmarks_is_theirs_and_shortest_paths_between(numbers: list[int]) -> None:
+    seif = run(FilterSettings(active_max=4), corridor(30))
+    linked, before = neighbours(seif), set(seif.active.tolist())
+    for k, number in enumerate(numbers):
+        after = set(kernels.blanket(seif._s, np.array(numbers[: k + 1])).tolist())
+        own, links = {number} | linked[number], links_between(linked, number, before, set(linked))
+        assert before | own <= after
+        assert len(after - before - own) == max(links - 2, 0)
+        assert links_between(linked, number, before, after) == links
+        before = after
+
+
+@pytest.mark.parametrize("numbers", FAR_APART)
+def test_a_joint_covariance_from_the_neighbourhood_is_the_dense_one_given_the_rest_of_the_map(
+    numbers: list[int],
+) -> None:
+    seif = run(FilterSettings(active_max=4), corridor(30))
+    P, blanket = np.linalg.inv(dense(seif)[0]), kernels.blanket(seif._s, np.array(numbers)).tolist()
+    rows = [0, 1, 2, *(3 + 2 * y + axis for y in blanket for axis in (0, 1))]
+    rest = np.setdiff1d(np.arange(len(P)), rows)
+    given_rest = P[np.ix_(rows, rows)] - P[np.ix_(rows, rest)] @ np.linalg.solve(
+        P[np.ix_(rest, rest)], P[np.ix_(rest, rows)]
+    )
+    own = [0, 1, 2, *(rows.index(3 + 2 * y + axis) for y in numbers for axis in (0, 1))]
+    got = seif.blanket_covariance(numbers)
+    np.testing.assert_allclose(got, given_rest[np.ix_(own, own)], rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(seif.covariance_of(numbers) - got)[0] > -1e-9 * np.max(np.abs(got))
+
+
+def test_the_neighbourhood_does_not_grow_with_the_map() -> None:
+    """Landmarks around the pose at the end of a way that is four times as long."""
+    sizes = []
+    for length in (20, 80):
+        seif = run(FilterSettings(active_max=4), corridor(length))
+        near = np.argsort(np.hypot(*(seif.landmarks - seif.pose[:2]).T))[:8]
+        sizes.append(len(kernels.blanket(seif._s, near)))
+    assert sizes[0] == sizes[1] < 20
 
 
 # Limits.
@@ -398,6 +458,6 @@ def test_the_sum_of_the_deltas_is_what_every_kind_holds(kind: str, strength: str
 
 def test_no_step_leaves_a_mark_in_the_scratch() -> None:
     seif = run(FilterSettings(active_max=4), drive(square(40, 5.0, 7), steps=50, seed=8))
-    seif.blanket_covariance(0)
+    seif.blanket_covariance([0, 7, 12])
     assert not np.any(seif._s.local[:100])
     assert kernels.block_ids(np.array([3, 5]), np.array([4, 3, 9])).tolist() == [3, 4, 5, 9]

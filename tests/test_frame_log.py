@@ -143,15 +143,30 @@ def test_guesses_are_known_landmarks_as_they_are_and_others_where_their_first_si
     np.testing.assert_allclose(guessed, np.array(list(expected.values())).reshape(-1, 2), atol=1e-9)
 
 
-@given(cases(), st.integers(-4, 6), st.integers(0, 9))
+@given(cases(), st.permutations(range(10)))
 @settled
-def test_a_name_is_changed_wherever_it_stands_and_no_other_is(case: Case, old: int, new: int) -> None:
-    before = [names.tolist() for _, names, _, _ in case.log.sightings]
-    arrays = [names for _, names, _, _ in case.log.sightings]
-    case.log.rename(old, new)
-    after = [names.tolist() for _, names, _, _ in case.log.sightings]
-    assert after == [[new if name == old else name for name in row] for row in before]
+def test_landmarks_are_renamed_wherever_they_stand_and_nothing_else_is(case: Case, names: list[int]) -> None:
+    before = [signature.tolist() for _, signature, _, _ in case.log.sightings]
+    arrays = [signature for _, signature, _, _ in case.log.sightings]
+    case.log.rename(np.array(names))
+    after = [signature.tolist() for _, signature, _, _ in case.log.sightings]
+    assert after == [[names[key] if key >= 0 else key for key in row] for row in before]
     assert all(a is b for a, (_, b, _, _) in zip(arrays, case.log.sightings))  # whoever shares them sees it
+
+
+@given(cases(), st.integers(-4, -2), st.integers(0, 9), st.integers(1, 3), st.booleans())
+@settled
+def test_an_accepted_landmark_has_its_number_wherever_it_stands_and_none_where_it_stands_too_rarely(
+    case: Case, old: int, new: int, least: int, restored: bool
+) -> None:
+    log = FrameLog.restored(msgpack.unpackb(msgpack.packb(case.log.state()), use_list=False)) if restored else case.log
+    before = [signature.tolist() for _, signature, _, _ in log.sightings]
+    arrays = [signature for _, signature, _, _ in log.sightings]
+    log.accept(old, new, least)
+    after = [signature.tolist() for _, signature, _, _ in log.sightings]
+    name = new if sum(row.count(old) for row in before) >= least else NONE
+    assert after == [[name if key == old else key for key in row] for row in before]
+    assert all(a is b for a, (_, b, _, _) in zip(arrays, log.sightings))
 
 
 @given(cases(), finite(1.0))

@@ -9,6 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from fleet_seif import own_map, own_window
 from fleet_seif.config import FilterSettings, PublishSettings
 from fleet_seif.errors import NumericalError, ReadingRefused
 from fleet_seif.filters import StepResult
@@ -120,6 +121,24 @@ def test_restored_after_every_step_it_publishes_the_same_bits(log: Drive, model:
     assert again.take_aliases() == whole.take_aliases()
     assert np.array_equal(again.assigned, whole.assigned)
     assert stored(again) == stored(whole)
+
+
+def test_restored_where_only_a_window_of_its_own_map_is_solved_it_publishes_the_same_bits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(own_map, "WHOLE_FRAMES", 2)
+    monkeypatch.setattr(own_window, "RECENT", 1)
+    monkeypatch.setattr(own_window, "SEEN_IN", 1)
+    whole, again = FramedFilter(SETTINGS), FramedFilter(SETTINGS)
+    whole.start(flight().start)
+    again.start(flight().start)
+    for k, each in enumerate(flight().readings):
+        if k % 6 == 0:
+            again = restarted(again)
+        assert told(*again.step(each), again) == told(*whole.step(each), whole)
+    assert len(whole.ends) > len(whole._own_map._numbers)
+    assert stored(again) == stored(whole)
+    assert (associate(flown(), whole.assigned).precision or 0.0) > 0.95
 
 
 def test_signatures_are_not_looked_at() -> None:

@@ -434,7 +434,7 @@ def published_by_small_runs() -> dict[str, Floats]:
     ):  # fmt: skip
         seif, total = run(FilterSettings.model_validate({"active_max": 4, **options}), log)
         delta = total.delta()
-        values = {**vars(delta), "mean": mean_of(seif), "blanket": seif.blanket_covariance(0)}
+        values = {**vars(delta), "mean": mean_of(seif), "blanket": seif.blanket_covariance([0, 7])}
         found |= {f"{name} {options}": np.asarray(value) for name, value in values.items()}
     return found
 

@@ -24,11 +24,11 @@ def compiled():
                 found[value.py_func.__module__ + "." + value.__name__] = len(value.signatures)
     return found
 
-warm_up(frames="adaptive", identities=sys.argv[1])
+warm_up(frames=sys.argv[2], identities=sys.argv[1])
 before = compiled()
 if sys.argv[1] == "associated":
     from tests.test_frames_associated import SETTINGS, FramedFilter, flight, restarted
-    framed = FramedFilter(SETTINGS)
+    framed = FramedFilter(SETTINGS.model_copy(update={"frames": sys.argv[2]}))
     framed.start(flight().start)
     for each in flight().readings:
         framed.step(each)
@@ -41,19 +41,20 @@ print(json.dumps([before, compiled()]))
 """
 
 
-def compiled(identities: str) -> tuple[dict[str, int], dict[str, int]]:
+def compiled(identities: str, frames: str = "adaptive") -> tuple[dict[str, int], dict[str, int]]:
     """How many variants of each kernel there are in a new process after warm-up, and after a flight."""
     run = subprocess.run(
-        [sys.executable, "-c", CODE, identities],
+        [sys.executable, "-c", CODE, identities, frames],
         check=True, capture_output=True, text=True, timeout=500, cwd=Path(__file__).parents[1],
     )  # fmt: skip
     before, after = json.loads(run.stdout)
     return before, after
 
 
-def test_after_warm_up_nothing_is_compiled_any_more_where_a_vehicle_finds_out_what_it_sees() -> None:
+@pytest.mark.parametrize("frames", ["adaptive", "single"])
+def test_after_warm_up_nothing_is_compiled_any_more_where_a_vehicle_finds_out_what_it_sees(frames: str) -> None:
     """Nor after its state was taken up again: arrays that cannot be written to would be another type."""
-    before, after = compiled("associated")
+    before, after = compiled("associated", frames)
     assert {name: count for name, count in after.items() if count != before.get(name, 0)} == {}
     assert before["fleet_seif.local_map.in_reach"] == 1
 

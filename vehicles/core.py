@@ -254,7 +254,7 @@ class VehicleCore:
             self.steps, self.time_s = step, reading.time_s
             self._given.append(len(reading.sightings.z))
             self._reading_bytes += len(kept[key])
-        self.filter.take_aliases()  # they have been published
+        self.filter.take_aliases(), self.filter.take_begun()  # they have been published
         newest = self.outbox.newest
         if newest is not None:
             self.healthy = newest.healthy or self.filter.doubtful
@@ -381,7 +381,10 @@ class VehicleCore:
         self._send(
             time_s=time_s,
             parts=parts,
-            landmarks=tuple((result.first_new + i, signature) for i, signature in enumerate(result.new)),
+            landmarks=(
+                *((result.first_new + i, signature) for i, signature in enumerate(result.new)),
+                *self.filter.take_begun(),
+            ),
             aliases=self.filter.take_aliases(),
             innovation=result.innovation,
             innovation_dof=2 * result.sightings,
@@ -396,7 +399,14 @@ class VehicleCore:
         if self.outbox.last < 0:
             raise ReadingRefused("the vehicle has not started: there is nothing to end")
         self.ended = True
-        self._send(time_s=self.time_s, parts=self.filter.end(), aliases=self.filter.take_aliases(), end=True)
+        parts = self.filter.end()
+        self._send(
+            time_s=self.time_s,
+            parts=parts,
+            landmarks=self.filter.take_begun(),
+            aliases=self.filter.take_aliases(),
+            end=True,
+        )
 
     def _send(self, **fields: object) -> None:
         identity = self.identity

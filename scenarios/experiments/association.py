@@ -50,7 +50,7 @@ def _errors_of_step(filter: Seif, model: int, reading: Reading) -> list[float]:
         rows = [0, 1, 2, 3 + 2 * k, 4 + 2 * k]
         likelihoods = [
             gaussian(r, J @ (F @ Sigma @ F.T + U) @ J.T + reading.sightings.cov[i])
-            for Sigma in (exact[np.ix_(rows, rows)], filter.blanket_covariance(number))
+            for Sigma in (exact[np.ix_(rows, rows)], filter.blanket_covariance([number]))
         ]
         errors.append(abs(likelihoods[1] / likelihoods[0] - 1.0))
     return errors
