@@ -60,30 +60,30 @@ def _blocks(model: int, mean: Floats, which: Ints) -> tuple[Floats, Floats, Floa
 
 @kernel
 def _spread(P: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
-    """P J' for sightings of these landmarks, shape (n, 2 c)."""
-    n, out = len(P), np.empty((len(P), 2 * len(which)))
+    """J P for sightings of these landmarks, shape (2 c, n)."""
+    n, out = len(P), np.empty((2 * len(which), len(P)))
     for i in range(len(which)):
         a = 3 + 2 * which[i]
-        for r in range(n):
-            for k in range(2):
-                out[r, 2 * i + k] = (
-                    P[r, 0] * J_x[i, k, 0] + P[r, 1] * J_x[i, k, 1] + P[r, 2] * J_x[i, k, 2]
-                    + P[r, a] * J_y[i, k, 0] + P[r, a + 1] * J_y[i, k, 1]
+        for k in range(2):
+            for j in range(n):
+                out[2 * i + k, j] = (
+                    P[0, j] * J_x[i, k, 0] + P[1, j] * J_x[i, k, 1] + P[2, j] * J_x[i, k, 2]
+                    + P[a, j] * J_y[i, k, 0] + P[a + 1, j] * J_y[i, k, 1]
                 )  # fmt: skip
     return out
 
 
 @kernel
 def _seen(spread: Floats, which: Ints, J_x: Floats, J_y: Floats) -> Floats:
-    """J (P J') for the same sightings, shape (2 c, 2 c)."""
+    """(J P) J' for the same sightings, shape (2 c, 2 c)."""
     m, out = 2 * len(which), np.empty((2 * len(which), 2 * len(which)))
-    for i in range(len(which)):
-        a = 3 + 2 * which[i]
-        for k in range(2):
-            for c in range(m):
-                out[2 * i + k, c] = (
-                    J_x[i, k, 0] * spread[0, c] + J_x[i, k, 1] * spread[1, c] + J_x[i, k, 2] * spread[2, c]
-                    + J_y[i, k, 0] * spread[a, c] + J_y[i, k, 1] * spread[a + 1, c]
+    for c in range(m):
+        for i in range(len(which)):
+            a = 3 + 2 * which[i]
+            for k in range(2):
+                out[c, 2 * i + k] = (
+                    J_x[i, k, 0] * spread[c, 0] + J_x[i, k, 1] * spread[c, 1] + J_x[i, k, 2] * spread[c, 2]
+                    + J_y[i, k, 0] * spread[c, a] + J_y[i, k, 1] * spread[c, a + 1]
                 )  # fmt: skip
     return (out + out.T) / 2
 
@@ -242,11 +242,10 @@ def _sighted(
 ) -> tuple[bool, Floats, Floats, float]:
     """Whether S is positive definite, then mean', P' and r' S^-1 r: see `sighted`."""
     h, J_x, J_y = _blocks(model, mean, which)
-    spread = _spread(P, which, J_x, J_y)
-    S, w = _seen(spread, which, J_x, J_y), _innovations(model, z, h)
+    gain = _spread(P, which, J_x, J_y)
+    S, w = _seen(gain, which, J_x, J_y), _innovations(model, z, h)
     for i in range(len(which)):
         S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += Z[i]
-    gain = np.ascontiguousarray(spread.T)
     if not _halved_into(gain, w, S):
         return False, mean, P, 0.0
     new, squared = mean.copy(), 0.0
