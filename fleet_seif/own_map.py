@@ -26,13 +26,11 @@ TRAVEL_LEAST: Final = 0.25
 
 class OwnMap:
     """See above. Frames are numbered from 0 on. aliases: pairs of landmarks that are one, the lesser number first.
-    misfit: chi-square per degree of freedom of all frames, each when `around` solved it last.
-    _fit (n, 3): of each frame then, chi-square, degrees of freedom and robust weight."""
+    _fit (n, 3): of each frame when `around` solved it last, chi-square, degrees of freedom and robust weight."""
 
     def __init__(self) -> None:
         self.frames: list[FrameDelta] = []
         self.aliases: list[tuple[int, int]] = []
-        self.misfit = 0.0
         self._solver = JointSolver()
         self._solution: JointSolution | None = None
         self._first = np.empty(0, np.int64)
@@ -42,6 +40,11 @@ class OwnMap:
         self._landmarks, self._poses = np.empty((0, 2)), np.empty((0, 3))
         self._fit = np.empty((0, 3))
         self._changed: set[int] = set()
+
+    @property
+    def misfit(self) -> float:
+        """Chi-square per degree of freedom of all frames, each when `around` solved it last."""
+        return float(self._fit[:, 0].sum() / max(int(self._fit[:, 1].sum()), 1))
 
     def put(self, frame: int, total: FrameDelta) -> None:
         """What a frame says, for the first time or anew."""
@@ -63,6 +66,7 @@ class OwnMap:
         earlier = OwnMap()
         earlier.frames, earlier.aliases = self.frames[:frame], self.aliases[:aliases]
         earlier._views, earlier._fit = self._views[:frame], self._fit[:frame]
+        earlier._changed = {number for number in self._changed if number < frame}
         if frame > WHOLE_FRAMES:
             earlier._poses = self._poses[:frame]
         return earlier
@@ -81,7 +85,6 @@ class OwnMap:
             self._poses = solution.pose_mean
         else:
             self._solution = solution = self._solve_window(most)
-        self.misfit = float(self._fit[:, 0].sum() / max(int(self._fit[:, 1].sum()), 1))
         newest = [k for _, _, k in solution.poses].index(-1)
         pose, landmarks = solution.pose_mean[newest], solution.landmark_mean
         chosen, travel_max_m = nearest(landmarks, pose, most, reach_m)
