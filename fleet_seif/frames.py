@@ -20,6 +20,7 @@
    together (seif_join).
 """
 
+import contextlib
 import dataclasses
 import logging
 from typing import Any
@@ -360,7 +361,9 @@ class FramedFilter:
         """What was told anew holds from now on; its corrections are to be published."""
         news = dict(zip(map(id, before), found.frames, strict=True))
         for old, new in zip(before, found.frames, strict=True):
-            for i, ((step, names, z, Z), (_, told, _, _)) in enumerate(zip(old.log.sightings, new.log.sightings)):
+            for i, ((step, names, z, Z), (_, told, _, _)) in enumerate(
+                zip(old.log.sightings, new.log.sightings, strict=True)
+            ):
                 names[:] = told  # the array that `assigned` has, too
                 new.log.sightings[i] = step, names, z, Z
         self._kept, self._closed, self._looked_at = (
@@ -473,6 +476,9 @@ class FramedFilter:
                 last = self._look_around_pose(last)
             end_pose = self.filter.pose if self._single else self._close()
             parts.append(FramePart(frame=frame, status=FrameStatus.ENDED, delta=last, end_pose=end_pose))
+        elif self._associator is not None and self.ends:  # the last solution is no part of the state
+            with contextlib.suppress(NumericalError):
+                self._own_map.around(self.settings.association.local_landmarks_max, self._associator.reach_m)
         for closed in self._closed:
             parts += self._corrected(closed)
         for closed in self._looked_at:
@@ -532,8 +538,10 @@ class FramedFilter:
         self.totals = [FrameTotal() for _ in state["totals"]]
         for total, data in zip(self.totals, state["totals"], strict=True):
             total.add(read_delta(data))
-        self._to_correct = {frame: (read_delta(whole), np.frombuffer(end)) for frame, whole, end in state["to_correct"]}
-        self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3))
+        self._to_correct = {
+            frame: (read_delta(whole), np.frombuffer(end).copy()) for frame, whole, end in state["to_correct"]
+        }
+        self.ends = list(np.frombuffer(state["ends"]).reshape(-1, 3).copy())
 
     def _share_keys(self) -> None:
         """What sightings are taken for is kept once: by the logs of frames and by `assigned`."""

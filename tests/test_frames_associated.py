@@ -141,6 +141,20 @@ def test_restored_where_only_a_window_of_its_own_map_is_solved_it_publishes_the_
     assert (associate(flown(), whole.assigned).precision or 0.0) > 0.95
 
 
+@pytest.mark.parametrize("steps", [50, 100])
+def test_restored_where_a_frame_has_just_closed_it_ends_with_the_same_bits(steps: int) -> None:
+    whole = FramedFilter(SETTINGS)
+    whole.start(flight().start)
+    for each in flight().readings[:steps]:
+        whole.step(each)
+    assert not whole._opened
+    again = restarted(whole)
+    parts = [(part.frame, delta_digest(part.delta)) for part in whole.end()]
+    assert [(part.frame, delta_digest(part.delta)) for part in again.end()] == parts
+    assert len({frame for frame, _ in parts}) > 1
+    assert stored(again) == stored(whole)
+
+
 def test_signatures_are_not_looked_at() -> None:
     plain, said = run(flight())
     for seed in (1, 2):
