@@ -162,9 +162,9 @@ class Seif:
         As certain as a frame's start, but no more than the step may still add (step_information_max).
         Raises NumericalError where it cannot be done; nothing has changed then.
         """
-        if not pairs:
-            return step
         most = self._growth_max - largest_growth(step)
+        if not pairs or most <= 0:
+            return step
         W = min(self.settings.start_information, 0.5 * most * H_QUANTUM / len(pairs))
         if self._s.counts[LINKS] + len(pairs) > len(self._s.H_link):
             self._grow(2 * len(self._s.H_link) + len(pairs))

@@ -227,6 +227,16 @@ def test_a_join_claims_no_more_than_what_the_step_leaves_of_the_declared_limit()
     assert quanta(1e3) < largest_growth(total) <= quanta(2e5)
 
 
+def test_where_the_step_leaves_nothing_of_the_declared_limit_no_join_is_made() -> None:
+    """A frame's start may be more certain than a step may be."""
+    seif = driven(step_information_max=2e5)
+    step = Seif(seif.settings).start(Sightings.none()).delta
+    assert largest_growth(step) > quanta(2e5)
+    before = seif.state()
+    assert seif.join([(1, 6)], step) is step
+    assert seif.state() == before
+
+
 def test_a_join_that_cannot_be_made_changes_nothing() -> None:
     seif = driven()
     seif._s.H_xx[:] = -np.eye(3)
