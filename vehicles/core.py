@@ -257,7 +257,7 @@ class VehicleCore:
         self.filter.take_aliases(), self.filter.take_begun()  # they have been published
         newest = self.outbox.newest
         if newest is not None:
-            self.healthy = newest.healthy or self.filter.doubtful
+            self.healthy = self.healthy and (newest.healthy or self.filter.doubtful)
         if self.outbox.ended:
             self.filter.end()  # what it published then has been published
 
@@ -342,7 +342,8 @@ class VehicleCore:
             raise
         except NumericalError:
             self._count_refused(reading.sightings)
-            self.healthy = False
+            if self.healthy:
+                self.healthy, self._state_bytes = False, -1  # the next step keeps the state, which says so
             raise
         self.steps += 1
         self._given.append(len(reading.sightings.z))
