@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from fleet_seif import frames as frames_module
+from fleet_seif import own_map, own_window
 from fleet_seif.config import FilterSettings, PublishSettings
 from fleet_seif.frames import FramedFilter
 from fleet_seif.information import FrameTotal, delta_digest
 from fleet_seif.messages import DeltaMessage, Epoch, FramePart, FrameStatus
 from fleet_seif.own_map import first_names
+from fleet_seif.streams import Coalescer
 from fleet_seif.way_back import told_anew
 from fleet_seif.wire import decode_message
 from fusion.life import LifeTotal
@@ -18,6 +20,7 @@ from scenarios.association import Association, associate
 from scenarios.config import load_scenario
 from scenarios.recording import Log
 from scenarios.source import record
+from tests import reference
 from tests.drives import FLEET, put
 from tests.identities import HALFWAY
 from tests.test_frames_associated import restarted, stored, told
@@ -106,14 +109,27 @@ def test_restored_after_every_step_it_finds_the_same_way_back_to_the_bit(monkeyp
     assert [delta_digest(p.delta) for p in restarted(again).end()] == [delta_digest(p.delta) for p in whole.end()]
 
 
+def core_of(settings: FilterSettings) -> VehicleCore:
+    identity = Identity(
+        fleet=FLEET, vehicle="ann", epoch=Epoch(1, 7), start_pose=slipped().start_pose, start_pose_cov=np.zeros((3, 3))
+    )
+    return VehicleCore(identity, settings, PublishSettings(window=10_000))
+
+
+def assert_has_all_of(life: LifeTotal, framed: FramedFilter) -> None:
+    assert {k: delta_digest(delta) for k, delta in life.checked.frames.items()} == {
+        k: delta_digest(delta) for k, delta in enumerate(framed.published())
+    }
+    for frame, end_pose in enumerate(framed.ends):
+        assert reference.same(life.frames[frame].end_pose, end_pose)
+    assert life.checked.aliases == tuple(sorted(framed._own_map.aliases))
+    assert life.checked.names == len(framed.signatures)
+
+
 @cache
 def published() -> tuple[tuple[DeltaMessage, ...], FramedFilter]:
     """The messages of the whole flight, and the filter that is behind them."""
-    log = slipped()
-    identity = Identity(
-        fleet=FLEET, vehicle="ann", epoch=Epoch(1, 7), start_pose=log.start_pose, start_pose_cov=np.zeros((3, 3))
-    )
-    core = VehicleCore(identity, SETTINGS, PublishSettings(window=10_000))
+    core, log = core_of(SETTINGS), slipped()
     core.start(0.0, log.sightings_at(0))
     for each in log.readings():
         core.step(each)
@@ -126,12 +142,44 @@ def test_a_node_has_what_the_vehicle_has_and_takes_back_what_is_one_no_more() ->
     life = LifeTotal()
     for message in messages:
         assert life.fold(message, check=True) is None
-    assert {k: delta_digest(delta) for k, delta in life.checked.frames.items()} == {
-        k: delta_digest(delta) for k, delta in enumerate(framed.published())
-    }
-    assert life.checked.aliases == tuple(sorted(framed._own_map.aliases))
+    assert_has_all_of(life, framed)
     assert any(not added for message in messages for _, _, added in message.aliases)
     assert [message.step for message in messages if not message.healthy] == list(range(LOST, BACK))
+
+
+@pytest.mark.parametrize("whole_frames", [2, 64])
+def test_however_often_it_finds_a_way_back_its_messages_are_what_it_knows(
+    whole_frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It always doubts; short frames are told anew two times out of three, the first one too, and a step publishes one
+    correction: more are due before they are through. Restored after every step; messages one by one and coalesced."""
+    monkeypatch.setattr(FramedFilter, "_looks_wrong", lambda *arguments: True)
+    monkeypatch.setattr(FramedFilter, "_looks_better", lambda framed, *arguments: framed.frame % 3 != 0)
+    monkeypatch.setattr(frames_module, "CORRECTIONS_EACH", 1)
+    monkeypatch.setattr(own_map, "WHOLE_FRAMES", whole_frames)
+    monkeypatch.setattr(own_window, "RECENT", 1)
+    settings, log = SETTINGS.model_copy(update={"frame_steps_max": 6}), slipped()
+    core, again = core_of(settings), FramedFilter(settings)
+    core.start(0.0, log.sightings_at(0))
+    again.start(log.sightings_at(0))
+    for each in list(log.readings())[:75]:
+        core.step(each)
+        again = restarted(again)
+        again.step(each)
+        assert stored(again) == stored(core.filter)
+    core.end()
+    again.end()
+    assert stored(again) == stored(core.filter)
+    messages = [decode_message(data) for data in put(core)]
+    assert sum(len(corrected(message.parts)) for message in messages) > 3 * len(core.filter.ends)
+    for count in (1, 7, len(messages)):
+        life = LifeTotal()
+        for at in range(0, len(messages), count):
+            joined = Coalescer(messages[at])
+            for message in messages[at + 1 : at + count]:
+                joined.add(message)
+            assert life.fold(joined.message(), check=True) is None
+        assert_has_all_of(life, core.filter)
 
 
 def test_what_is_told_anew_changes_nothing_that_it_is_given() -> None:
