@@ -31,7 +31,7 @@ ALONE_SIGMAS: Final = 3.0
 """A pair by itself counts where its distance and so many standard deviations reach at most half way to the next one."""
 
 
-def nearest_m(places: Floats, k: int = 1) -> Floats:
+def nearest_m(places: Floats, k: int) -> Floats:
     """How far the k-th nearest other place is, m, shape (n,); infinite where there are not so many."""
     return np.asarray(scipy.spatial.KDTree(places).query(places, [k + 1])[0])[:, 0] if len(places) else np.empty(0)
 
