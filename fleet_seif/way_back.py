@@ -26,7 +26,7 @@ from fleet_seif.records import Floats, Sightings
 @dataclass(frozen=True)
 class ToldAnew:
     """frames: with what their sightings are of now. solved: what the batch over each says, and its end pose.
-    known: landmarks that have a number. unclear: see Duplicates. misfit_before: of the earlier frames by themselves."""
+    known: landmarks that have a number. unclear: see Duplicates."""
 
     frames: list[Closed]
     solved: list[tuple[FrameDelta, Floats]]
@@ -34,7 +34,6 @@ class ToldAnew:
     associator: Associator
     known: int
     unclear: float
-    misfit_before: float
 
 
 def told_anew(
@@ -51,7 +50,6 @@ def told_anew(
     unclear = 0.0
     try:
         _look_around(anew, own, known, most)
-        misfit_before = own.misfit
         for frame in frames:
             none = np.empty(0, np.int64)
             again.append(
@@ -75,7 +73,7 @@ def told_anew(
             _look_around(anew, own, known if frame is not frames[-1] else 0, most)
     except NumericalError:
         return None
-    return ToldAnew(again, solved, own, anew, most, unclear, misfit_before)
+    return ToldAnew(again, solved, own, anew, most, unclear)
 
 
 def _look_around(associator: Associator, own: OwnMap, known: int, most: int) -> None:
