@@ -53,10 +53,10 @@ KEPT_FRAMES = 16
 """Closed frames whose readings are kept, while the vehicle is sound; where it is doubtful, those since, too."""
 KEPT_FRAMES_MAX = 64
 """Closed frames whose readings are kept at most."""
-BACK_UNCLEAR = 0.5
-"""Share of `unclear_max` up to which what was told anew is taken."""
-BACK_MISFIT = 1.1
-"""How many times the misfit before that of what was told anew may be; a misfit below 1 is none."""
+BACK_SHARE = 0.55
+"""Share of the limits of doubt up to which what was told anew is taken."""
+BACK_COUNT = 1.1
+"""How many times the landmarks of before there may be then."""
 CORRECTIONS_EACH = 16
 """Frames that are corrected with one step, on the way back from doubt."""
 FRAME_LANDMARKS_MAX = 4096
@@ -332,15 +332,17 @@ class FramedFilter:
         while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
             self._late += self._looked_at_again(self._looked_at.pop(0))
 
-    def _looks_wrong(self, unclear: float, own: OwnMap) -> bool:
+    def _looks_wrong(self, unclear: float, own: OwnMap, share: float = 1.0) -> bool:
+        """Whether that much is unclear, or fits so badly. share: of the limits."""
         limits = self.settings.association
-        return unclear > limits.unclear_max or own.misfit > limits.misfit_max
+        return unclear > share * limits.unclear_max or own.misfit > share * limits.misfit_max
 
-    def _looks_better(self, unclear: float, own: OwnMap) -> bool:
-        """Whether what was told anew looks right, by more than a hair, and its frames fit no worse than before."""
-        limits = self.settings.association
-        misfit_max = min(limits.misfit_max, BACK_MISFIT * max(self._own_map.misfit, 1.0))
-        return unclear <= BACK_UNCLEAR * limits.unclear_max and own.misfit <= misfit_max
+    def _looks_right(self, found: ToldAnew) -> bool:
+        """Whether what was told anew is sound by more than a hair, and hardly a landmark has come to be: else the older
+        map has not been found again."""
+        if self._looks_wrong(found.unclear, found.own_map, BACK_SHARE):
+            return False
+        return found.own_map.count <= BACK_COUNT * self._own_map.count
 
     def _find_way_back(self, frame: int, since: int, associator: Associator) -> None:
         """Tell the last frames anew, from the further back the longer the doubt lasts; take it where it looks right."""
@@ -353,7 +355,7 @@ class FramedFilter:
             return
         known = len(self._names.signatures)
         found = told_anew(again, self._own_map, associator, self.settings, self.model, known)
-        if found is not None and self._looks_better(found.unclear, found.own_map):
+        if found is not None and self._looks_right(found):
             log.info("way_back frame=%d doubtful_since=%d told_anew_from=%d", frame, since, first)
             self._take_back(again, found)
 

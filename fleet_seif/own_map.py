@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet_seif.delta_wire import pack_delta, read_delta
 from fleet_seif.errors import NumericalError
-from fleet_seif.information import FrameDelta
+from fleet_seif.information import POSE, FrameDelta
 from fleet_seif.jit import one_thread
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes
 from fleet_seif.joint_solver import WARM_ENOUGH
@@ -61,6 +61,18 @@ class OwnMap:
             if (one, other) not in self.aliases:
                 self.aliases.append((one, other))
 
+    @property
+    def count(self) -> int:
+        """How many landmarks there are."""
+        numbers = [delta.variables[delta.variables != POSE] - 1 for delta in self.frames]
+        present = np.unique(np.concatenate([np.empty(0, np.int64), *numbers]))
+        return len(np.unique(self._first_names()[present]))
+
+    def _first_names(self) -> Ints:
+        """See `first_names`: of all landmarks that are in a frame or a pair."""
+        numbers = [int(delta.variables[-1]) for delta in self.frames if len(delta.variables)]
+        return first_names(self.aliases, max([0, *numbers, *(other + 1 for _, other in self.aliases)]))
+
     def until(self, frame: int, aliases: int) -> "OwnMap":
         """The map of the frames before this one alone, with the first so many pairs; a small one is solved anew."""
         earlier = OwnMap()
@@ -77,9 +89,7 @@ class OwnMap:
 
         At most so many, as `nearest` has it. Raises NumericalError where the frames cannot be solved.
         """
-        numbers = [int(delta.variables[-1]) for delta in self.frames if len(delta.variables)]
-        count = max([0, *numbers, *(other + 1 for _, other in self.aliases)])
-        self._solution, self._first = None, first_names(self.aliases, count)
+        self._solution, self._first = None, self._first_names()
         if len(self.frames) <= WHOLE_FRAMES:
             self._solution = solution = self._solve(self.frames, np.arange(len(self.frames)), np.zeros(3), WARM_ENOUGH)
             self._poses = solution.pose_mean

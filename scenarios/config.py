@@ -122,17 +122,19 @@ def load_scenario(name: str, overrides: tuple[str, ...] = (), seed: int | None =
 
 def _override(tables: dict[str, Any], override: str) -> None:
     key, equals, value = override.partition("=")
-    names = key.strip().split(".")
-    if not equals or len(names) != 2 or not all(names):
+    *path, name = key.strip().split(".")
+    if not equals or not path or not all((*path, name)):
         raise ScenarioError(f"--set {override!r}: expected TABLE.KEY=VALUE, for instance fleet.vehicles=5")
     try:
         parsed = tomllib.loads(f"v = {value}")["v"]
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
-    table = tables.setdefault(names[0], {})
-    if not isinstance(table, dict):
-        raise ScenarioError(f"--set {override!r}: {names[0]} is a key, not a table")
-    table[names[1]] = parsed
+    table: Any = tables
+    for part in path:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise ScenarioError(f"--set {override!r}: {part} is a key, not a table")
+    table[name] = parsed
 
 
 def _explain(source: str, error: ValidationError) -> str:

@@ -63,6 +63,13 @@ def test_set_changes_a_key_and_keeps_the_rest() -> None:
     assert changed.world == plain.world
 
 
+def test_set_reaches_the_keys_of_a_table_within_a_table() -> None:
+    changed = load_scenario("fleet", ("filter.association.confirm_sightings=4",))
+    assert changed.filter.association.confirm_sightings == 4
+    with pytest.raises(ScenarioError, match="kind is a key, not a table"):
+        load_scenario("fleet", ("filter.kind=eif", "filter.kind.x=3"))
+
+
 def test_the_correction_of_a_frame_waits_for_landmarks_to_be_confirmed_where_the_vehicle_finds_out_which_they_are() -> (
     None
 ):
