@@ -154,7 +154,7 @@ def test_however_often_it_finds_a_way_back_its_messages_are_what_it_knows(
     """It always doubts; short frames are told anew two times out of three, the first one too, and a step publishes one
     correction: more are due before they are through. Restored after every step; messages one by one and coalesced."""
     monkeypatch.setattr(FramedFilter, "_looks_wrong", lambda *arguments: True)
-    monkeypatch.setattr(FramedFilter, "_looks_better", lambda framed, *arguments: framed.frame % 3 != 0)
+    monkeypatch.setattr(FramedFilter, "_looks_right", lambda framed, *arguments: framed.frame % 3 != 0)
     monkeypatch.setattr(frames_module, "CORRECTIONS_EACH", 1)
     monkeypatch.setattr(own_map, "WHOLE_FRAMES", whole_frames)
     monkeypatch.setattr(own_window, "RECENT", 1)
