@@ -51,8 +51,8 @@ AGAIN_FRAMES = 4
 """A frame is looked at again when so many more have closed."""
 KEPT_FRAMES = 16
 """Closed frames whose readings are kept, while the vehicle is sound; where it is doubtful, those since, too."""
-KEPT_FRAMES_MAX = 64
-"""Closed frames whose readings are kept at most."""
+KEPT_FRAMES_MAX = 48
+"""Closed frames whose readings are kept at most: a doubt that has lasted for 32 is looked into for the last time."""
 BACK_SHARE = 0.55
 """Share of the limits of doubt up to which what was told anew is taken."""
 BACK_COUNT = 1.1

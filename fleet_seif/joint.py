@@ -76,8 +76,17 @@ def landmark_classes(
         ]
     if forced or forbidden or aliases or merged:
         same = [(group[0], other) for group in map(sorted, groups.values()) for other in group[1:]]
-        return _joined(names, [*forced, *sorted([*same, *aliases])], forbidden, merged)
+        linking = {name for pair in aliases for name in pair}.difference(
+            names
+        )  # of no landmark, but aliases go on there
+        joined = _joined([*names, *linking], [*forced, *sorted([*same, *aliases])], forbidden, merged)
+        return joined if not linking else _without(joined, linking)
     return tuple(sorted(tuple(sorted(group)) for group in groups.values()))
+
+
+def _without(classes: Classes, absent: set[LandmarkName]) -> Classes:
+    present = (tuple(name for name in names if name not in absent) for names in classes)
+    return tuple(sorted(names for names in present if names))
 
 
 def _joined(

@@ -68,7 +68,8 @@ class Comparison:
         if own is None or heard is None or not _are_comparable(own, joint) or own.map_digest == joint.map_digest:
             return False
         self._compared[joint.node] = own.map_digest, joint.map_digest
-        self._differing[joint.node] = differing(joint.node, own.names, joint.names)
+        ours, theirs = own.names, joint.names
+        self._differing[joint.node] = differing(joint.node, ours, theirs) or differing(joint.node, theirs, ours)
         return not self._differing[joint.node]
 
     def _judge(self, node: str) -> bool:

@@ -61,7 +61,7 @@ def targets(rows: Sequence[SeedScore]) -> str:
     blamed = sum(each.flagged and not each.diverged for each in vehicles)
     found, wrong, missed = (sum(getattr(row, field) for row in rows) for field in ("found", "wrong", "missed"))
     of, ratio = pooled_association(rows), pooled_errors(rows).ratio
-    worst = max(rows, key=lambda row: row.fused.ratio)
+    worst = max(rows, key=lambda row: row.fused.ratio if row.fused.known else 0.0)
     precision, recall, true = share(of.precision), share(of.recall), found / max(found + missed, 1)
     table = (
         ("seeds without a diverged vehicle", ">= 47/50", f"{sound}/{len(rows)}", 50 * sound >= 47 * len(rows)),

@@ -23,6 +23,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from fleet_seif.errors import RunError
 from fleet_seif.joint import JointSolution, solve
 from fleet_seif.merging import merged
 from fleet_seif.records import Floats, Ints
@@ -200,8 +201,13 @@ def score(name: str, scenario: Scenario) -> SeedScore:
     """Both runs of one seed."""
     recording = record(scenario)
     run = virtual.run_virtual(name, scenario, recording)
-    known, outcome = identified_run(scenario, recording), evaluate(run)
-    flagged = frozenset(outcome.report["doubtful_vehicles"])
+    known = identified_run(scenario, recording)
+    try:
+        outcome = evaluate(run)
+    except RunError:  # no vehicle is part of the map: all say that they are doubtful
+        flagged = frozenset(recording.logs)
+    else:
+        flagged = frozenset(outcome.report["doubtful_vehicles"])
     vehicles = tuple(
         VehicleScore(
             name=vehicle,
@@ -211,10 +217,15 @@ def score(name: str, scenario: Scenario) -> SeedScore:
         )
         for vehicle, log in recording.logs.items()
     )
+    seed = scenario.run.seed
+    if len(flagged) == len(recording.logs):
+        return SeedScore(
+            seed=seed, vehicles=vehicles, found=0, wrong=0, missed=0, known=0, fused=Errors(), fused_all=Errors()
+        )
     ours, theirs = outcome.solution, solved_without(known, flagged)
     everyones = solved_without(known, frozenset()) if flagged else theirs
     return SeedScore(
-        seed=scenario.run.seed,
+        seed=seed,
         vehicles=vehicles,
         found=outcome.score.merges - outcome.score.wrong_merges,
         wrong=outcome.score.wrong_merges,

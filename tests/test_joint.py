@@ -1,5 +1,6 @@
 """The joint map against a dense Gauss-Newton over the same frames."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -269,6 +270,14 @@ def life(
 
 def test_a_landmark_without_information_is_none() -> None:
     assert landmark_classes([life("a", (5, 6), named=1)]) == ((LandmarkName("a", 0, 0),),)
+
+
+def test_aliases_hold_through_a_landmark_without_information() -> None:
+    """Its sightings may have gone to the others since."""
+    chain = dataclasses.replace(life("a", (-1, -1, -1), named=2), aliases=((0, 2), (1, 2)))
+    assert landmark_classes([chain]) == ((LandmarkName("a", 0, 0), LandmarkName("a", 0, 1)),)
+    alone = dataclasses.replace(life("a", (-1, -1, -1), named=1), aliases=((1, 2),))
+    assert landmark_classes([alone]) == ((LandmarkName("a", 0, 0),),)
 
 
 def test_two_equal_vehicles_add_their_information() -> None:
