@@ -12,8 +12,8 @@
 7. Where nothing tells which landmark a sighting is of (identities = "associated"), an Associator decides, against what
    the closed frames say about where the open one starts and what lies around it (own_map). Where too many landmarks may
    be another one, or the frames do not fit each other, the vehicle has probably taken some for their neighbours: it is
-   doubtful until a frame closes after which neither is so. Or until it finds a way back: what the sightings of the
-   last frames are of is told anew (way_back), and where that looks right these frames are corrected.
+   doubtful until a frame closes after which neither is nearly so. Or until it finds a way back: what the sightings of
+   the last frames are of is told anew (way_back), and where that looks right these frames are corrected.
 8. With frames = "single" what lies around the pose comes from the one filter itself, every frame_steps_max steps
    (surroundings), and only the sighting that has a landmark accepted, and later ones, enter the filter: earlier ones
    would have to be worked into poses that are gone. Landmarks begun twice become aliases, and the filter holds them
@@ -53,8 +53,8 @@ KEPT_FRAMES = 16
 """Closed frames whose readings are kept, while the vehicle is sound; where it is doubtful, those since, too."""
 KEPT_FRAMES_MAX = 48
 """Closed frames whose readings are kept at most: a doubt that has lasted for 32 is looked into for the last time."""
-BACK_SHARE = 0.55
-"""Share of the limits of doubt up to which what was told anew is taken."""
+SOUND_SHARE = 0.55
+"""Share of the limits of doubt up to which a doubtful vehicle is sound again, and what was told anew is taken."""
 BACK_COUNT = 1.1
 """How many times the landmarks of before there may be then."""
 CORRECTIONS_EACH = 16
@@ -322,7 +322,7 @@ class FramedFilter:
             local = associator.local
             near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
         associator.begin(*near)
-        if not self._looks_wrong(duplicates.unclear, own):
+        if not self._looks_wrong(duplicates.unclear, own, 1.0 if self._doubtful_since is None else SOUND_SHARE):
             self._doubtful_since = None
         else:
             if self._doubtful_since is None:
@@ -340,7 +340,7 @@ class FramedFilter:
     def _looks_right(self, found: ToldAnew) -> bool:
         """Whether what was told anew is sound by more than a hair, and hardly a landmark has come to be: else the older
         map has not been found again."""
-        if self._looks_wrong(found.unclear, found.own_map, BACK_SHARE):
+        if self._looks_wrong(found.unclear, found.own_map, SOUND_SHARE):
             return False
         return found.own_map.count <= BACK_COUNT * self._own_map.count
 
