@@ -57,13 +57,13 @@ SOUND_SHARE = 0.55
 """Share of the limits of doubt up to which a doubtful vehicle is sound again, and what was told anew is taken."""
 BACK_COUNT = 1.1
 """How many times the landmarks of before there may be then."""
+CROWDED_MAX = 0.15
+"""Share of the landmarks around that may be crowded (own_duplicates) where a way back is taken; where there are more in
+a single frame, the vehicle is doubtful."""
 CORRECTIONS_EACH = 16
 """Frames that are corrected with one step, on the way back from doubt."""
 FRAME_LANDMARKS_MAX = 4096
 """Landmarks of one frame of several, for which its filter reserves space."""
-
-CROWDED_MAX = 0.15
-"""A vehicle of a single frame is doubtful while a larger share of the landmarks around are crowded (own_duplicates)."""
 
 
 def _told(seen: Sightings, decision: Decision | None) -> Sightings:
@@ -338,11 +338,11 @@ class FramedFilter:
         return unclear > share * limits.unclear_max or own.misfit > share * limits.misfit_max
 
     def _looks_right(self, found: ToldAnew) -> bool:
-        """Whether what was told anew is sound by more than a hair, and hardly a landmark has come to be: else the older
-        map has not been found again."""
+        """Whether what was told anew is sound by more than a hair, and the older map has been found again: else there
+        are many more landmarks than before, or they lie where hardly two can."""
         if self._looks_wrong(found.unclear, found.own_map, SOUND_SHARE):
             return False
-        return found.own_map.count <= BACK_COUNT * self._own_map.count
+        return found.own_map.count <= BACK_COUNT * self._own_map.count and found.associator.crowded() <= CROWDED_MAX
 
     def _find_way_back(self, frame: int, since: int, associator: Associator) -> None:
         """Tell the last frames anew, from the further back the longer the doubt lasts; take it where it looks right."""
