@@ -34,8 +34,9 @@ class AssociationSettings(Settings):
     nodes_max: partial hypotheses looked at after which the best so far is taken, and again for all rivals together.
     confirm_sightings, confirm_steps: a new landmark is provisional until it has been sighted so many times within so
     many steps in which it was within reach, the first included; else it is forgotten: clutter, or something that moves.
-    unclear_max, misfit_max: a vehicle says that it is doubtful while a larger share of the landmarks around may be
-    another one, or while chi-square per row of its frames is larger.
+    unclear_max, misfit_max, unseen_max: a vehicle says that it is doubtful while a larger share of the landmarks around
+    may be another one, while chi-square per row of its frames is larger, or while it does not see a larger share of the
+    landmarks that should be in view.
     local_landmarks_max: landmarks around the start of a frame that sightings are compared with; where there are more, a
     frame closes before the vehicle leaves them behind.
 
@@ -54,6 +55,7 @@ class AssociationSettings(Settings):
     confirm_steps: Annotated[int, Field(ge=1, le=1000)] = 8
     unclear_max: Probability = 0.2
     misfit_max: Positive = 2.0
+    unseen_max: Probability = 0.2
     local_landmarks_max: Annotated[int, Field(ge=10, le=1000)] = 150
 
 

@@ -11,9 +11,10 @@
 6. With frames = "single" there is one, which closes at the end and is never corrected.
 7. Where nothing tells which landmark a sighting is of (identities = "associated"), an Associator decides, against what
    the closed frames say about where the open one starts and what lies around it (own_map). Where too many landmarks may
-   be another one, or the frames do not fit each other, the vehicle has probably taken some for their neighbours: it is
-   doubtful until a frame closes after which neither is nearly so. Or until it finds a way back: what the sightings of
-   the last frames are of is told anew (way_back), and where that looks right these frames are corrected.
+   be another one, the frames do not fit each other, or what should be in view is not seen, the vehicle has probably
+   taken some for their neighbours: it is doubtful until a frame closes after which none of this is nearly so. Or until
+   it finds a way back: what the sightings of the last frames are of is told anew (way_back), and where that looks right
+   these frames are corrected.
 8. With frames = "single" what lies around the pose comes from the one filter itself, every frame_steps_max steps
    (surroundings), and only the sighting that has a landmark accepted, and later ones, enter the filter: earlier ones
    would have to be worked into poses that are gone. Landmarks begun twice become aliases, and the filter holds them
@@ -322,7 +323,8 @@ class FramedFilter:
             local = associator.local
             near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
         associator.begin(*near)
-        if not self._looks_wrong(duplicates.unclear, own, 1.0 if self._doubtful_since is None else SOUND_SHARE):
+        share = 1.0 if self._doubtful_since is None else SOUND_SHARE
+        if not self._looks_wrong(duplicates.unclear, own, associator, share):
             self._doubtful_since = None
         else:
             if self._doubtful_since is None:
@@ -332,15 +334,19 @@ class FramedFilter:
         while self._looked_at and self._looked_at[0].frame + AGAIN_FRAMES <= closed.frame:
             self._late += self._looked_at_again(self._looked_at.pop(0))
 
-    def _looks_wrong(self, unclear: float, own: OwnMap, share: float = 1.0) -> bool:
-        """Whether that much is unclear, or fits so badly. share: of the limits."""
+    def _looks_wrong(self, unclear: float, own: OwnMap, associator: Associator, share: float) -> bool:
+        """Whether that much is unclear, fits so badly, or is not seen. share: of the limits."""
         limits = self.settings.association
-        return unclear > share * limits.unclear_max or own.misfit > share * limits.misfit_max
+        return (
+            unclear > share * limits.unclear_max
+            or own.misfit > share * limits.misfit_max
+            or associator.unseen > share * limits.unseen_max
+        )
 
     def _looks_right(self, found: ToldAnew) -> bool:
         """Whether what was told anew is sound by more than a hair, and the older map has been found again: else there
         are many more landmarks than before, or they lie where hardly two can."""
-        if self._looks_wrong(found.unclear, found.own_map, SOUND_SHARE):
+        if self._looks_wrong(found.unclear, found.own_map, found.associator, SOUND_SHARE):
             return False
         return found.own_map.count <= BACK_COUNT * self._own_map.count and found.associator.crowded() <= CROWDED_MAX
 

@@ -16,7 +16,7 @@ from fleet_seif.dense import cholesky_into, inverse_2x2
 from fleet_seif.errors import NumericalError
 from fleet_seif.geometry import wrap
 from fleet_seif.jit import kernel
-from fleet_seif.models import heading_column, innovation_numbers, move, place, sight_numbers
+from fleet_seif.models import COMPASS_XY, heading_column, innovation_numbers, move, place, sight_numbers
 from fleet_seif.records import Floats, Ints
 
 
@@ -127,6 +127,19 @@ def in_reach(mean: Floats, P: Floats, reach: float, sigmas: float) -> Ints:
             variance += P[a + k, a + k] + P[k, k] - 2.0 * P[a + k, k]
         most = reach + sigmas * np.sqrt(max(variance, 0.0))
         if 0.0 < dx * dx + dy * dy <= most * most:
+            found[count] = i
+            count += 1
+    return found[:count]
+
+
+@kernel
+def in_view(model: int, mean: Floats, reach_m: float, bearing: float) -> Ints:
+    """Landmarks nearer than `reach_m`, and where headings count within `bearing` of straight ahead."""
+    count, found = 0, np.empty((len(mean) - 3) // 2, np.int64)
+    for i in range(len(found)):
+        dx, dy = mean[3 + 2 * i] - mean[0], mean[4 + 2 * i] - mean[1]
+        ahead = model == COMPASS_XY or abs(wrap(np.arctan2(dy, dx) - mean[2])) <= bearing
+        if ahead and 0.0 < dx * dx + dy * dy <= reach_m * reach_m:
             found[count] = i
             count += 1
     return found[:count]

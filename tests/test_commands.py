@@ -296,7 +296,7 @@ def test_status_says_how_every_vehicle_is(node: Network) -> None:
     assert joint["node"] == "fusion"
     assert [(state["name"], state["cut"], state["behind"]) for state in joint["vehicles"]] == [("v1", 70, 0)]
     assert joint["map_digest"][:16] in told.stdout
-    assert joint["merging"]["version"] <= joint["version"]
+    assert joint["merging"]["version"] >= 1  # of this map, or of one that came while it was asked for
     assert joint["merging"]["kept_apart"] == {}
 
 

@@ -1,6 +1,7 @@
 """Frames of a vehicle that finds out by itself what it sees: what it publishes, and that it goes on to the bit."""
 
 import dataclasses
+import itertools
 import logging
 from functools import cache
 from typing import Any
@@ -292,3 +293,16 @@ def test_what_is_published_adds_up_to_what_the_filter_says_it_has_published() ->
         for part in parts:
             totals.setdefault(part.frame, FrameTotal()).add(part.delta)
     assert [delta_digest(totals[k].delta()) for k in sorted(totals)] == [delta_digest(d) for d in framed.published()]
+
+
+@pytest.mark.parametrize("lie_rad", [0.0, 0.5])
+def test_where_odometry_lies_the_vehicle_does_not_see_what_should_be_in_view_and_says_so(lie_rad: float) -> None:
+    """It begins its map a second time, turned: that fits itself, and no landmark may be another one."""
+    log = record(load_scenario("three_air_vehicles_unknown", (), 101), "v1").logs["v1"]
+    framed = FramedFilter(SETTINGS)
+    framed.start(log.sightings_at(0))
+    for step, each in enumerate(itertools.islice(log.readings(), 230), start=1):
+        lie = np.array([0.0, 0.0, lie_rad if step == 150 else 0.0])
+        framed.step(dataclasses.replace(each, odometry=each.odometry + lie))
+    assert framed._associator is not None
+    assert framed.doubtful == (framed._associator.unseen > SETTINGS.association.unseen_max) == (lie_rad > 0.0)

@@ -17,6 +17,7 @@ from fleet_seif.local_map import (
     expected,
     from_pose_std,
     in_reach,
+    in_view,
     kept,
     moved,
     nothing_known,
@@ -291,3 +292,15 @@ def test_a_covariance_that_is_none_is_a_numerical_error() -> None:
     local = LocalMap(np.array([0.0, 0.0, 0.0, 1.0, 0.0]), np.eye(5), np.array([3]))
     with pytest.raises(NumericalError, match="positive definite"):
         sighted(RANGE_BEARING, local, np.zeros(1, np.int64), np.array([[1.0, 0.0]]), -9.0 * np.eye(2)[None])
+
+
+@given(
+    st.integers(0, 2**32 - 1), st.floats(0.1, 3.0), st.floats(0.0, np.pi), st.sampled_from([RANGE_BEARING, COMPASS_XY])
+)
+@settled
+def test_in_view_is_what_lies_near_and_ahead(seed: int, reach_m: float, bearing: float, model: int) -> None:
+    mean = np.random.default_rng(seed).uniform(-3.0, 3.0, 23)
+    d = mean[3:].reshape(-1, 2) - mean[:2]
+    angle = np.angle(np.exp(1j * (np.arctan2(d[:, 1], d[:, 0]) - mean[2])))
+    inside = (np.hypot(*d.T) <= reach_m) & ((np.abs(angle) <= bearing) | (model == COMPASS_XY))
+    assert in_view(model, mean, reach_m, bearing).tolist() == np.flatnonzero(inside).tolist()

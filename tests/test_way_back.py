@@ -34,7 +34,7 @@ LOST, BACK = 125, 150
 @cache
 def slipped() -> Log:
     """Noise half way to the paper's, with which some vehicles take landmarks for their neighbours."""
-    return record(load_scenario("three_air_vehicles_unknown", ("world.steps=220", *HALFWAY), 1), "v1").logs["v1"]
+    return record(load_scenario("three_air_vehicles_unknown", ("world.steps=220", *HALFWAY), 24), "v1").logs["v1"]
 
 
 def flown(framed: FramedFilter) -> list[tuple[tuple[FramePart, ...], bool]]:
