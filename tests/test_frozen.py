@@ -39,9 +39,10 @@ RATE_HZ = 20.0
 PHASE_S = 6.0
 SETTLE_S = 2.0
 FACTOR = 2.0
-FLOOR_S = 2.0 / RATE_HZ
+FLOOR_S = {"ack": 2.0 / RATE_HZ, "map": 1.0}
 """Two periods of a vehicle: what a scheduler may add where three processes share two busy cores (0.08 s was seen). With
-one queue for all sources, acknowledgements take 0.23 s (95 %) under valid messages, 3.7 s under continued ones."""
+one queue for all sources, acknowledgements take 0.23 s (95 %) under valid messages, 3.7 s under continued ones, and
+maps 3.9 s. A map has to be solved: sixty frames at once, of a vehicle that drives as fast as it can, took 0.6 s more."""
 FLOOD_HZ = 3000
 BATCH = 30
 EPOCHS = 200
@@ -179,7 +180,7 @@ def check(what: str, probe: Probe, disturb: Callable[[], None]) -> None:
     after = probe.measure()
     print(f"{what}: " + ", ".join(f"{name} {1e3 * before[name]:.1f} -> {1e3 * after[name]:.1f} ms" for name in before))
     for name, baseline in before.items():
-        assert after[name] <= FACTOR * baseline + FLOOR_S, name
+        assert after[name] <= FACTOR * baseline + FLOOR_S[name.split()[0]], name
 
 
 def test_stopped_subscribers_do_not_slow_the_others(fleet: tuple[Fleet, Child]) -> None:
