@@ -42,7 +42,7 @@ FACTOR = 2.0
 FLOOR_S = {"ack": 2.0 / RATE_HZ, "map": 1.0}
 """Two periods of a vehicle: what a scheduler may add where three processes share two busy cores (0.08 s was seen). With
 one queue for all sources, acknowledgements take 0.23 s (95 %) under valid messages, 3.7 s under continued ones, and
-maps 3.9 s. A map has to be solved: sixty frames at once, of a vehicle that drives as fast as it can, took 0.6 s more."""
+maps 3.9 s. A map has to be solved: sixty frames of a vehicle that drives as fast as it can took 0.6 s more."""
 FLOOD_HZ = 3000
 BATCH = 30
 EPOCHS = 200
