@@ -197,6 +197,10 @@ class Associator:
         """Whether this pose in the frame is so far from its start that the local map may lack what is sighted."""
         return bool(np.hypot(pose[0], pose[1]) >= self.travel_max_m)
 
+    def around(self) -> tuple[LocalMap, float]:
+        """What to `begin` with where nothing else tells what lies around: the accepted landmarks, as they are."""
+        return begun_at(kept(self.local, np.flatnonzero(self.local.keys >= 0))), self.travel_max_m
+
     @one_thread
     def duplicates(self) -> Duplicates:
         """Landmarks that have been begun twice (rule 3): pairs of keys."""

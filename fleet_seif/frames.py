@@ -38,7 +38,6 @@ from fleet_seif.frame_log import NONE, FrameLog
 from fleet_seif.geometry import act_all, between, compose
 from fleet_seif.information import FrameDelta, FrameTotal
 from fleet_seif.joint import JointSolution, JointSolver, Life, landmark_classes, landmark_names
-from fleet_seif.local_map import begun_at, kept
 from fleet_seif.messages import FramePart, FrameStatus
 from fleet_seif.models import RANGE_BEARING
 from fleet_seif.own_map import OwnMap, first_names
@@ -320,8 +319,7 @@ class FramedFilter:
             near = own.around(self.settings.association.local_landmarks_max, associator.reach_m)
         except NumericalError as error:
             log.warning("own_map_not_solved frame=%d reason=%s", closed.frame, error)
-            local = associator.local
-            near = begun_at(kept(local, np.flatnonzero(local.keys >= 0))), associator.travel_max_m
+            near = associator.around()
         associator.begin(*near)
         share = 1.0 if self._doubtful_since is None else SOUND_SHARE
         if not self._looks_wrong(duplicates.unclear, own, associator, share):
@@ -428,7 +426,7 @@ class FramedFilter:
             near = around_pose(self.filter, first, limits.local_landmarks_max, associator.reach_m)
         except NumericalError as error:
             log.warning("not_looked_around step=%d reason=%s", self.steps, error)
-            near = begun_at(kept(associator.local, np.flatnonzero(associator.local.keys >= 0))), associator.travel_max_m
+            near = associator.around()
         associator.begin(*near)
         doubtful = duplicates.unclear > limits.unclear_max or associator.crowded() > CROWDED_MAX
         self._doubtful_since = self.frame if doubtful else None

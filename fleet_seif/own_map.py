@@ -111,8 +111,7 @@ class OwnMap:
             raise NumericalError("no own map: its frames could not be solved")
         poses = [i for i, (_, _, k) in enumerate(solution.poses) if k == at[0]]
         start = solution.pose_mean[poses[0]] if poses else self._start
-        away = np.hypot(*(solution.landmark_mean - start[:2]).T)
-        chosen = np.sort(np.argsort(away, kind="stable")[:most])
+        chosen, _ = nearest(solution.landmark_mean, start, most, 0.0)
         P = self._solver.joint_covariance(solution, chosen, np.array(poses, np.int64))
         if not poses:  # the first frame's start is given
             whole = np.zeros((len(P) + 3, len(P) + 3))

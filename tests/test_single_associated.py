@@ -7,30 +7,34 @@ import numpy as np
 import pytest
 
 from fleet_seif.associator import Associator
-from fleet_seif.config import FilterSettings, PublishSettings
+from fleet_seif.config import FilterSettings
 from fleet_seif.errors import NumericalError
 from fleet_seif.frame_log import NONE
 from fleet_seif.frames import CROWDED_MAX, FramedFilter
 from fleet_seif.information import FrameDelta, delta_digest, largest_growth, quanta, to_information
 from fleet_seif.local_map import LocalMap
-from fleet_seif.messages import DeltaMessage, Epoch
-from fleet_seif.models import COMPASS_XY, RANGE_BEARING
+from fleet_seif.messages import DeltaMessage
 from fleet_seif.own_duplicates import crowded
 from fleet_seif.own_map import first_names
 from fleet_seif.records import UNKNOWN_SIGNATURE, Floats, Ints, Sightings
 from fleet_seif.seif import Seif
 from fleet_seif.surroundings import around_pose
-from fleet_seif.wire import decode_message
 from fusion.life import LifeTotal
 from scenarios.association import associate
-from tests.drives import FLEET, Drive, drive, put, square, sum_deltas
-from tests.test_frames_associated import compass, flight, flown, relabelled, restarted, run, stored, told
-from vehicles.core import Identity, VehicleCore
+from tests.drives import Drive, drive, square, sum_deltas
+from tests.test_frames_associated import (
+    LOGS,
+    assert_restored_after_every_step_it_publishes_the_same_bits,
+    flight,
+    flown,
+    messages,
+    relabelled,
+    restarted,
+    run,
+    stored,
+)
 
 SETTINGS = FilterSettings(frames="single", identities="associated", active_max=12)
-LOGS = pytest.mark.parametrize(
-    ("log", "model"), [(flight(), RANGE_BEARING), (compass(), COMPASS_XY)], ids=["air", "compass"]
-)
 
 
 @cache
@@ -40,18 +44,7 @@ def flew() -> FramedFilter:
 
 @LOGS
 def test_restored_after_every_step_it_publishes_the_same_bits(log: Drive, model: int) -> None:
-    whole, again = FramedFilter(SETTINGS, model), FramedFilter(SETTINGS, model)
-    whole.start(log.start)
-    again.start(log.start)
-    for each in log.readings:
-        again = restarted(again)
-        assert told(*again.step(each), again) == told(*whole.step(each), whole)
-        assert stored(again) == stored(whole)
-    again = restarted(again)
-    assert [delta_digest(p.delta) for p in again.end()] == [delta_digest(p.delta) for p in whole.end()]
-    assert again.take_aliases() == whole.take_aliases()
-    assert np.array_equal(again.assigned, whole.assigned)
-    assert stored(again) == stored(whole)
+    assert_restored_after_every_step_it_publishes_the_same_bits(log, SETTINGS, model)
 
 
 def test_signatures_are_not_looked_at() -> None:
@@ -104,17 +97,7 @@ def test_what_sightings_are_taken_for_is_right_with_few_exceptions() -> None:
 
 @cache
 def published() -> tuple[DeltaMessage, ...]:
-    """The messages of a whole flight."""
-    log = flight()
-    identity = Identity(
-        fleet=FLEET, vehicle="ann", epoch=Epoch(1, 7), start_pose=log.start_pose, start_pose_cov=np.zeros((3, 3))
-    )
-    core = VehicleCore(identity, SETTINGS, PublishSettings(window=10_000))
-    core.start(0.0, log.start)
-    for each in log.readings:
-        core.step(each)
-    core.end()
-    return tuple(decode_message(data) for data in put(core))
+    return messages(flight(), SETTINGS)
 
 
 def test_a_node_takes_every_message_and_the_frame_is_positive_definite_after_each() -> None:
