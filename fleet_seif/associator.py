@@ -43,6 +43,7 @@ from fleet_seif.own_duplicates import Duplicates, crowded, own_duplicates, spaci
 from fleet_seif.records import Bools, Floats, Ints
 from fleet_seif.seif import FAULTS
 from fleet_seif.seif_step import check_reading
+from fleet_seif.unseen import Unseen
 
 DOUBTFUL_SIGMAS: Final = 3.0
 """A landmark is told from its neighbour where so many standard deviations reach at most half way to it."""
@@ -50,12 +51,6 @@ LIFETIMES: Final = 10
 """A provisional landmark out of reach is kept for so many times `confirm_steps`."""
 IN_VIEW_SHARE: Final = 0.8
 """Share of the largest distance, and bearing, of all sightings up to which a landmark should be in view."""
-EXPECTED_STEPS: Final = 5
-"""Steps of a frame in which a landmark should have been in view, to be missed."""
-EXPECTED_LEAST: Final = 5
-"""Landmarks that should have been in view, for a share of them to say anything."""
-UNSEEN_FRAMES: Final = 4
-"""Newest frames over which they are counted."""
 REACH_SIGMAS: Final = 4.0
 """How far beyond what was measured a landmark may be, in standard deviations, to be compared at all."""
 NOBODY: Final[Counter[int]] = Counter()
@@ -102,9 +97,7 @@ class Associator:
         self._together: dict[int, Counter[int]] = {}
         self._apart: dict[int, float] = {}
         self._bearing = 0.0
-        self._expected: Counter[int] = Counter()
-        self._sighted: set[int] = set()
-        self._missed: list[tuple[int, int]] = []
+        self._unseen = Unseen()
 
     def anew(self) -> "Associator":
         """One that has met what this one has, and knows of no provisional landmark."""
@@ -184,14 +177,12 @@ class Associator:
         local = self.local
         inside = in_view(self.model, local.mean, IN_VIEW_SHARE * self.reach_m, IN_VIEW_SHARE * self._bearing)
         inside = inside[~self._are_doubtful(local, inside)]
-        self._expected.update(key for key in local.keys[inside].tolist() if key >= 0)
-        self._sighted.update(seen)
+        self._unseen.add((key for key in local.keys[inside].tolist() if key >= 0), seen)
 
     @property
     def unseen(self) -> float:
         """Share of the landmarks that should have been in view in the last frames, but were not sighted in them."""
-        missed, expected = (sum(counts) for counts in zip((0, 0), *self._missed, strict=True))
-        return missed / expected if expected >= EXPECTED_LEAST else 0.0
+        return self._unseen.share
 
     def has_left(self, pose: Floats) -> bool:
         """Whether this pose in the frame is so far from its start that the local map may lack what is sighted."""
@@ -229,9 +220,7 @@ class Associator:
 
         barred: those that are not compared with sightings, however well their places are known.
         """
-        expected = {key for key, steps in self._expected.items() if steps >= EXPECTED_STEPS}
-        self._missed = [*self._missed, (len(expected - self._sighted), len(expected))][-UNSEEN_FRAMES:]
-        self._expected, self._sighted = Counter(), set()
+        self._unseen.close()
         carried = np.flatnonzero(self.local.keys < NONE)
         spacing = spacing_m(near.landmarks, self._met(near.keys)).tolist()
         self._apart = dict(zip(near.keys.tolist(), spacing, strict=True)) | dict.fromkeys(barred, 0.0)
@@ -244,8 +233,7 @@ class Associator:
             "mean": local.mean.tobytes(), "P": local.P.tobytes(), "keys": local.keys.tobytes(), "next": self._next,
             "travel": self.travel_max_m, "reach": self.reach_m, "apart": list(self._apart.items()),
             "together": [(key, list(others.items())) for key, others in self._together.items()],
-            "bearing": self._bearing, "expected": list(self._expected.items()), "sighted": sorted(self._sighted),
-            "missed": list(self._missed),
+            "bearing": self._bearing, "unseen": self._unseen.state(),
             "provisional": [(key, each.born, each.sightings, each.chances) for key, each in self._provisional.items()],
         }  # fmt: skip
 
@@ -257,8 +245,8 @@ class Associator:
         self.travel_max_m, self.reach_m, self._next = state["travel"], state["reach"], state["next"]
         self._apart = dict(state["apart"])
         self._together = {key: Counter(dict(others)) for key, others in state["together"]}
-        self._bearing, self._missed = state["bearing"], [(a, b) for a, b in state["missed"]]
-        self._expected, self._sighted = Counter(dict(state["expected"])), set(state["sighted"])
+        self._bearing = state["bearing"]
+        self._unseen.restore(state["unseen"])
         self._provisional = {key: Provisional(*rest) for key, *rest in state["provisional"]}
 
 
